@@ -6,6 +6,9 @@ use std::path::PathBuf;
 use bytesize::ByteSize;
 use clap::Parser;
 
+/// The packaged daemon's data folder.
+pub const DEFAULT_DATA: &str = "/var/lib/raysweep";
+
 /// Capture daemon for light-transport rigs.
 #[derive(Parser)]
 #[command(
@@ -24,7 +27,7 @@ pub struct DaemonArguments {
     #[arg(long, value_name = "PATH")]
     pub live: Option<PathBuf>,
     /// Data folder, in which sessions are stored.
-    #[arg(long, value_name = "DIR", default_value = "/var/lib/raysweep")]
+    #[arg(long, value_name = "DIR", default_value = DEFAULT_DATA)]
     pub data: PathBuf,
     /// Group whose members may operate the rig; other users who can connect may only observe.
     #[arg(long, value_name = "GROUP", default_value = "raysweep")]
@@ -33,7 +36,7 @@ pub struct DaemonArguments {
     /// end [default: the free memory when the run begins]
     #[arg(long, value_name = "SIZE", value_parser = memory_size)]
     pub memory: Option<ByteSize>,
-    /// Read the rig file, open every device once, print what was found, and exit.
+    /// Read the rig file, examine every device as `raysweep doctor` does, print what was found, and exit.
     #[arg(long)]
     pub check: bool,
 }

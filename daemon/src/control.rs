@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use raysweep_proto::{
-    CalibrationInfo, CheckReport, DesignParams, DesignReport, Event, ResumeParams, RpcError, RunParams,
-    SessionInfo, Started, Status,
+    CalibrationInfo, CheckReport, DesignParams, DesignReport, DoctorParams, DoctorReport, Event,
+    ResumeParams, RpcError, RunParams, SessionInfo, Started, Status, ViewfinderParams,
 };
 use tokio::sync::broadcast;
 
@@ -24,6 +24,12 @@ pub trait Control: Send + Sync + 'static {
     /// # Errors
     /// `InvalidPlan`, with the position in the plan's text; `BadParams`.
     fn design(&self, params: &DesignParams) -> Result<DesignReport, RpcError>;
+
+    /// Examines the rig and its host; opens the devices, so no run can begin meanwhile.
+    ///
+    /// # Errors
+    /// `Busy`, `InvalidPlan`.
+    fn doctor(&self, params: &DoctorParams) -> Result<DoctorReport, RpcError>;
 
     /// Starts a run.
     ///
@@ -78,6 +84,12 @@ pub trait Control: Send + Sync + 'static {
     /// # Errors
     /// `NoSession`, `Storage`.
     fn use_calibration(&self, session: &Path) -> Result<(), RpcError>;
+
+    /// Changes what the running viewfinder shows.
+    ///
+    /// # Errors
+    /// `NotRunning`, `InvalidParams`.
+    fn viewfinder(&self, wanted: &ViewfinderParams) -> Result<(), RpcError>;
 
     /// Subscribes to all events from now on.
     fn events(&self) -> broadcast::Receiver<Event>;

@@ -5,6 +5,7 @@ pub mod cli;
 mod computing;
 pub mod control;
 mod devices;
+pub mod doctor;
 pub mod journal;
 pub mod live;
 pub mod mirror;

@@ -13,8 +13,8 @@ use raysweep_core::{CameraCapabilities, Size, io_text};
 use raysweep_pipeline::message_of;
 use raysweep_processing::calibration::{CalibrationHeader, KeptCalibration, current_in};
 use raysweep_proto::{
-    CalibrationInfo, CheckReport, DesignParams, DesignReport, ErrorCode, Event, Mistake, ResumeParams,
-    RpcError, RunParams, RunState, SessionInfo, Started, Status,
+    CalibrationInfo, CheckReport, DesignParams, DesignReport, DoctorParams, DoctorReport, ErrorCode, Event,
+    Mistake, ResumeParams, RpcError, RunParams, RunState, SessionInfo, Started, Status, ViewfinderParams,
 };
 use raysweep_session::integrity::{Audit, Damage, DamagedPart, changed_inputs};
 use raysweep_session::ledger::{EndState, Ledger, LedgerText, SessionEntry};
@@ -23,14 +23,16 @@ use tokio::sync::broadcast;
 
 use crate::computing::Computing;
 use crate::control::Control;
+use crate::doctor::{self, PlanNeeds};
 use crate::live::{LiveFile, Outlet};
 use crate::mirror;
 use crate::probes::Probes;
-use crate::procedure::lab::{Lab, LabRig};
+use crate::procedure::lab::Lab;
 use crate::procedure::{Unresumable, foresee, foresee_rest, past};
-use crate::rig::{AnyRig, RigError};
+use crate::rig::{AnyRig, RigError, SharedRig};
 use crate::run::board::{StatusBoard, WrongState};
 use crate::run::life::{Foreseen, Run, conduct};
+use crate::run::look::{NoViewfinder, check_look};
 use crate::run::orders::{Order, Orders};
 
 /// Frame rate at which a dot rig's camera is opened to check that it is present; each run opens it at its own rate.
@@ -50,7 +52,7 @@ const CALIBRATION: &str = "calibration";
 
 /// The daemon's core: a rig, a data folder, and at most one run.
 pub struct Runner {
-    rig: LabRig,
+    rig: SharedRig,
     /// Capabilities of the rig's camera when the daemon started.
     camera: CameraCapabilities,
     data: PathBuf,
@@ -86,14 +88,11 @@ impl Runner {
     /// # Errors
     /// The first device that cannot be opened.
     pub fn new(rig: impl Into<AnyRig>, data: PathBuf) -> Result<Self, RigError> {
-        let (rig, camera, kind) = match rig.into() {
-            AnyRig::Plane(rig) => {
-                let camera = rig.open()?.camera.capabilities().clone();
-                (LabRig::Plane(rig.into()), camera, "plane")
-            }
-            AnyRig::Dots(rig) => {
-                let camera = rig.open(&data, LEAST_FRAME_RATE_HZ)?.camera.capabilities().clone();
-                (LabRig::Dots(rig.into()), camera, "dots")
+        let rig = SharedRig::from(rig.into());
+        let (camera, kind) = match &rig {
+            SharedRig::Plane(rig) => (rig.open()?.camera.capabilities().clone(), "plane"),
+            SharedRig::Dots(rig) => {
+                (rig.open(&data, LEAST_FRAME_RATE_HZ)?.camera.capabilities().clone(), "dots")
             }
         };
         Ok(Self {
@@ -214,12 +213,20 @@ impl Runner {
         Ok(())
     }
 
-    /// Reserves the daemon for a run, prepares it and starts its thread; after an error, the daemon is free again.
-    /// Meanwhile, orders can be given.
+    /// Reserves the daemon for a run, prepares it and starts its thread.
     fn start(
         &self,
         begin: impl FnOnce(&Arc<Orders>) -> Result<(Started, JoinHandle<()>), RpcError>,
     ) -> Result<Started, RpcError> {
+        self.reserved(|orders| begin(orders).map(|(started, thread)| (started, Some(thread))))
+    }
+
+    /// Reserves the daemon while `begin` works; unless that has started a run's thread, the daemon is then free again.
+    /// Meanwhile, orders can be given.
+    fn reserved<T>(
+        &self,
+        begin: impl FnOnce(&Arc<Orders>) -> Result<(T, Option<JoinHandle<()>>), RpcError>,
+    ) -> Result<T, RpcError> {
         let orders = Arc::new(Orders::default());
         let last = {
             let mut current = self.lock();
@@ -241,14 +248,14 @@ impl Runner {
             Err(RpcError::new(ErrorCode::Internal, what))
         });
         let mut current = self.lock();
-        let (started, thread) = match begun {
-            Ok((started, thread)) => (Ok(started), Some(thread)),
-            Err(error) => {
-                // The run has not begun, so it has not failed.
-                let _ = self.board.go(RunState::Idle);
-                (Err(error), None)
-            }
+        let (result, thread) = match begun {
+            Ok((result, thread)) => (Ok(result), thread),
+            Err(error) => (Err(error), None),
         };
+        if thread.is_none() {
+            // No run has begun, so none has failed.
+            let _ = self.board.go(RunState::Idle);
+        }
         // There is no current run if the daemon did not wait for the preparation before it shut down.
         match (&mut *current, thread) {
             (Some(current), Some(thread)) => current.thread = Some(thread),
@@ -256,7 +263,7 @@ impl Runner {
             (None, Some(_cancelled)) => {}
         }
         self.prepared.notify_all();
-        started
+        result
     }
 
     /// Starts the thread of a run.
@@ -297,8 +304,8 @@ impl Runner {
     }
 
     /// Checks that disk and memory suffice, and that the run ends some day; `instead` advises the user if memory does
-    /// not suffice.
-    fn check_needs(&self, report: &CheckReport, instead: &str) -> Result<(), RpcError> {
+    /// not suffice. A session that is resumed already has `stored_bytes`.
+    fn check_needs(&self, report: &CheckReport, instead: &str, stored_bytes: u64) -> Result<(), RpcError> {
         if report.light_s > MOST_HOURS * 3600.0 {
             let what = format!(
                 "the run would take {:.0} hours of light, and at most {MOST_HOURS} are allowed: take fewer points or frames",
@@ -306,10 +313,11 @@ impl Runner {
             );
             return Err(RpcError::new(ErrorCode::InvalidPlan, what));
         }
-        if report.disk_bytes > report.disk_free_bytes {
+        let disk_bytes = report.disk_bytes.saturating_sub(stored_bytes);
+        if disk_bytes > report.disk_free_bytes {
             let what = format!(
                 "the session needs {}, but {} has only {} free: free some space or give the daemon another --data",
-                Size(report.disk_bytes),
+                Size(disk_bytes),
                 self.data.display(),
                 Size(report.disk_free_bytes)
             );
@@ -328,7 +336,7 @@ impl Runner {
 
     fn begin(&self, params: &RunParams, orders: &Arc<Orders>) -> Result<(Started, JoinHandle<()>), RpcError> {
         let foreseen = self.foresee(&params.plan)?;
-        self.check_needs(&foreseen.report, foreseen.instead)?;
+        self.check_needs(&foreseen.report, foreseen.instead, 0)?;
         self.go_on_preparing(orders)?;
         let entry = SessionEntry {
             format: raysweep_session::ledger::FORMAT,
@@ -392,7 +400,7 @@ impl Runner {
         if let Some(what) = past(&plan) {
             return Err(no_session(format!("{}: {what}", session.dir().display())));
         }
-        if read(session.rig_path())? != self.rig.text() {
+        if !self.rig.is_of(&read(session.rig_path())?) {
             return Err(no_session(format!(
                 "{} was begun with another rig file than the daemon's: start the daemon with {}",
                 session.dir().display(),
@@ -427,6 +435,8 @@ impl Runner {
             );
             return Err(no_session(what));
         }
+        let stored_bytes = session.stored_bytes().map_err(|error| storage(&error))?;
+        self.check_needs(&foreseen.report, foreseen.instead, stored_bytes)?;
         self.go_on_preparing(orders)?;
         self.spawn(foreseen, session, ledger, Start { orders, is_resumed: true })
     }
@@ -435,8 +445,8 @@ impl Runner {
 impl Control for Runner {
     fn status(&self) -> Status {
         let guard = match &self.rig {
-            LabRig::Plane(_) => mirror::light_guard(&self.data, None),
-            LabRig::Dots(rig) => rig.light_guard(&self.data),
+            SharedRig::Plane(_) => mirror::light_guard(&self.data, None),
+            SharedRig::Dots(rig) => rig.light_guard(&self.data),
         };
         Status { mirror: mirror::status(&self.data, &guard), ..self.board.status() }
     }
@@ -464,6 +474,18 @@ impl Control for Runner {
         )
     }
 
+    fn doctor(&self, params: &DoctorParams) -> Result<DoctorReport, RpcError> {
+        let plan = params.plan.as_ref().map(|plan| self.foresee(plan)).transpose()?;
+        let needs = plan.map(|Foreseen { report, .. }| PlanNeeds {
+            disk_bytes: report.disk_bytes,
+            light_s: report.light_s,
+        });
+        self.reserved(|orders| {
+            let report = doctor::examine(&self.rig, &self.data, needs, &|| orders.go_on());
+            Ok((report, None))
+        })
+    }
+
     fn run(&self, params: RunParams) -> Result<Started, RpcError> {
         self.start(|orders| self.begin(&params, orders))
     }
@@ -488,8 +510,8 @@ impl Control for Runner {
 
     fn arm_light(&self) -> Result<(), RpcError> {
         let is_without_mirror = match &self.rig {
-            LabRig::Plane(_) => true,
-            LabRig::Dots(rig) => rig.file.mirror.is_none(),
+            SharedRig::Plane(_) => true,
+            SharedRig::Dots(rig) => rig.file.mirror.is_none(),
         };
         if is_without_mirror {
             let what = "this rig has no mirror: there is no light to permit";
@@ -569,6 +591,18 @@ impl Control for Runner {
         })?;
         self.computing.forget();
         kept.use_in(&self.data).map_err(|error| storage(&error))
+    }
+
+    fn viewfinder(&self, wanted: &ViewfinderParams) -> Result<(), RpcError> {
+        check_look(wanted, &self.camera)?;
+        let none = || {
+            let what = "no viewfinder is running: `raysweep viewfinder` starts one";
+            RpcError::new(ErrorCode::NotRunning, what)
+        };
+        let current = self.lock();
+        let is_over = matches!(self.board.status().state, RunState::Idle | RunState::Faulted);
+        let current = current.as_ref().filter(|_| !is_over).ok_or_else(none)?;
+        current.orders.look.change(wanted).map_err(|NoViewfinder| none())
     }
 
     fn events(&self) -> broadcast::Receiver<Event> {

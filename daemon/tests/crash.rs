@@ -1,20 +1,19 @@
-//! The real daemon in a separate process: killed at any moment, asked to terminate, activated by a socket.
+//! The real daemon in a separate process: killed after any line of the ledger, asked to terminate, activated by a socket.
+//! `kills` kills it at any moment.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
+mod daemon;
 mod outcome;
 mod process;
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Command, Stdio};
-use std::time::{Duration, Instant};
 
-use nix::sys::signal::Signal;
+use daemon::{Daemon, end, plan, wait_for_line};
 use outcome::{Outcome, outcome};
 use process::Process;
-use rand_xoshiro::Xoshiro256PlusPlus;
-use rand_xoshiro::rand_core::{Rng, SeedableRng};
-use raysweep_proto::{Client, ClientError, ErrorCode, Event, RunParams};
+use raysweep_proto::{ClientError, ErrorCode, Event};
 use raysweep_session::Session;
 use raysweep_session::film::TransportFilm;
 use raysweep_session::ledger::{PointEntry, State};
@@ -35,54 +34,6 @@ const RIG: &str = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver
 const PLAN: &str = "kind = \"sweep\"\nname = \"crash\"\n[sweep]\naverage = 2\n\
                     delay_us = [-60, 0, 60]\nexposure_us = [50, 100, 150]\n";
 
-struct Daemon {
-    process: Process,
-    socket: PathBuf,
-}
-
-impl Daemon {
-    fn start(folder: &Path) -> Self {
-        Self::start_with_threads(folder, 2)
-    }
-
-    /// Simulator, stages and solver all take their number of threads from rayon's environment variable.
-    fn start_with_threads(folder: &Path, threads: u32) -> Self {
-        let socket = folder.join("socket");
-        let mut command = Command::new(env!("CARGO_BIN_EXE_raysweepd"));
-        command
-            .arg("--rig")
-            .arg(folder.join("rig.toml"))
-            .arg("--socket")
-            .arg(&socket)
-            .arg("--data")
-            .arg(folder.join("sessions"))
-            .env("RAYON_NUM_THREADS", threads.to_string())
-            .stderr(Stdio::null());
-        let process = Process::start(&mut command);
-        Self { process, socket }
-    }
-
-    fn client(&mut self) -> Client {
-        let began = Instant::now();
-        loop {
-            if let Ok(client) = Client::connect(&self.socket) {
-                return client;
-            }
-            assert!(!self.process.has_ended(), "the daemon has ended");
-            assert!(began.elapsed() < Duration::from_secs(60), "the daemon does not listen");
-            std::thread::sleep(Duration::from_millis(2));
-        }
-    }
-
-    fn kill(self) {
-        drop(self);
-    }
-
-    fn terminate(&self) {
-        self.process.signal(Signal::SIGTERM);
-    }
-}
-
 fn folder(rig: &str) -> TempDir {
     folder_in(&std::env::temp_dir(), rig)
 }
@@ -93,76 +44,8 @@ fn folder_in(parent: &Path, rig: &str) -> TempDir {
     folder
 }
 
-fn plan(text: &str) -> RunParams {
-    RunParams { plan: text.into(), ..RunParams::default() }
-}
-
-/// Starts a run and waits for its end.
-fn end(daemon: &mut Daemon, begin: impl FnOnce(&mut Client)) -> (PathBuf, String) {
-    let events = daemon.client().subscribe().unwrap();
-    begin(&mut daemon.client());
-    for event in events {
-        if let Event::Finished { session, state, .. } = event.unwrap() {
-            return (session, state);
-        }
-    }
-    panic!("the daemon ended before the run");
-}
-
-/// Waits until the ledger has a given number of lines.
-fn wait_for_line(session: &Path, line: usize) {
-    let began = Instant::now();
-    while ledger_lines(session) < line {
-        let lines = ledger_lines(session);
-        assert!(began.elapsed() < Duration::from_secs(60), "{lines} lines, not {line}, after a minute");
-        std::thread::sleep(Duration::from_micros(200));
-    }
-}
-
-fn ledger_lines(session: &Path) -> usize {
-    std::fs::read_to_string(session.join("ledger.jsonl")).unwrap().lines().count()
-}
-
 fn stored(session: &Path) -> Option<State> {
     Session::open(session).and_then(|session| session.state()).ok()
-}
-
-#[test]
-fn fifty_kills_and_resumes_end_like_a_run_without_any() {
-    let reference = folder(RIG);
-    let mut daemon = Daemon::start(reference.path());
-    let (session, state) = end(&mut daemon, |client| drop(client.run(&plan(PLAN)).unwrap()));
-    let lines = ledger_lines(&session);
-    assert_eq!(state, "complete");
-    let expected = outcome(&session);
-    assert_eq!(expected.points.len(), 9 + 4 + 1);
-    daemon.kill();
-
-    let mut random = Xoshiro256PlusPlus::seed_from_u64(1);
-    let (mut killed_within, mut resumed_points) = (0, Vec::new());
-    for _ in 0..50 {
-        // The time of the kill is anywhere in the run: up to 3 ms after any line of its ledger.
-        let seed = random.next_u64();
-        let (line, later) = (1 + seed as usize % lines, Duration::from_micros(seed / 1000 % 3000));
-        let crashed = folder(RIG);
-        let mut daemon = Daemon::start(crashed.path());
-        let mut client = daemon.client();
-        let session = client.run(&plan(PLAN)).unwrap().session;
-        wait_for_line(&session, line);
-        std::thread::sleep(later);
-        daemon.kill();
-
-        let before = stored(&session).expect("a ledger that can be read after a crash");
-        killed_within += usize::from(before.end.is_none());
-        resumed_points.push(before.stored(ArrayName::Sum).count());
-        let mut daemon = Daemon::start(crashed.path());
-        let (session, state) = end(&mut daemon, |client| drop(client.resume(&session).unwrap()));
-        assert_eq!(state, "complete");
-        assert!(outcome(&session) == expected, "killed {later:?} after line {line}: the session differs");
-        daemon.kill();
-    }
-    println!("killed {killed_within} of 50 within the run, with these points stored: {resumed_points:?}");
-    assert!(killed_within >= 25, "the moments do not lie within the run: only {killed_within} did");
 }
 
 /// Kills a run after `line` lines of its ledger, resumes it, and compares the outcome with that of an uninterrupted
@@ -418,6 +301,25 @@ fn a_damaged_session_fails_verify_and_process_until_the_damage_is_accepted() {
     assert!(outcome(&session).files == before, "the products are kept");
     let (exit, out, _) = raysweep(&["process", "--accept-damage"], &session);
     assert!(exit == 0 && out.contains("made from what is stored: 8 of 9"), "{exit} {out}");
+}
+
+#[test]
+fn results_of_a_processing_that_was_killed_before_its_manifest_are_sound_once_made_again() {
+    let folder = folder(RIG);
+    let epipolar = |width| format!("{PLAN}[[product]]\nkind = \"epipolar\"\nwidth_rows = {width}\n");
+    let mut daemon = Daemon::start(folder.path());
+    let (session, _) = end(&mut daemon, |client| drop(client.run(&plan(&epipolar(3))).unwrap()));
+    daemon.kill();
+    let manifest = std::fs::read(session.join("manifest.json")).unwrap();
+    std::fs::write(session.join("plan.toml"), epipolar(5)).unwrap();
+    assert_eq!(raysweep(&["process", "--accept-edits"], &session).0, 0);
+    std::fs::write(session.join("manifest.json"), manifest).unwrap();
+    let (exit, out, _) = raysweep(&["verify"], &session);
+    assert!(exit == 1 && out.contains("products/epipolar"), "{exit} {out}");
+    // The same bytes as before, so that they alone do not tell that they are new.
+    assert_eq!(raysweep(&["process"], &session).0, 0);
+    let (exit, out, _) = raysweep(&["verify"], &session);
+    assert_eq!((exit, out.as_str()), (0, "nothing is damaged; 9 of 9 points are stored\n"));
 }
 
 #[test]

@@ -78,17 +78,18 @@ fn sweep(folder: &Path, clients: usize) -> Swept {
             .await
         }
     });
-    let (ended, calls) = (AtomicBool::new(false), AtomicU64::new(0));
+    let (begun, ended, calls) = (AtomicBool::new(false), AtomicBool::new(false), AtomicU64::new(0));
     let began = std::time::Instant::now();
     let lost = std::thread::scope(|scope| {
         for client in 0..clients {
-            let (socket, ended, calls) = (&socket, &ended, &calls);
-            scope.spawn(move || hammer(client, socket, ended, calls));
+            let (socket, begun, ended, calls) = (&socket, &begun, &ended, &calls);
+            scope.spawn(move || hammer(client, socket, [begun, ended], calls));
         }
         let mut events = runner.events();
         // The clients are at it when the run begins.
         std::thread::sleep(Duration::from_millis(300));
         runner.run(RunParams { plan: PLAN.into(), ..RunParams::default() }).unwrap();
+        begun.store(true, Ordering::Relaxed);
         let session = loop {
             match events.blocking_recv() {
                 Ok(Event::Finished { session, state, error, .. }) => {
@@ -114,8 +115,8 @@ fn sweep(folder: &Path, clients: usize) -> Swept {
     Swept { lost, run_s, p50_ms: at(0.5), p99_ms: at(0.99), calls: calls.into_inner() }
 }
 
-/// Calls everything that a client can call without ending the run.
-fn hammer(client: usize, socket: &Path, ended: &AtomicBool, calls: &AtomicU64) {
+/// Calls everything that a client can call without ending the run, or beginning another one before it.
+fn hammer(client: usize, socket: &Path, [begun, ended]: [&AtomicBool; 2], calls: &AtomicU64) {
     let mut connection = Client::connect(socket).ok();
     let mut number = client;
     while !ended.load(Ordering::Relaxed) {
@@ -130,7 +131,9 @@ fn hammer(client: usize, socket: &Path, ended: &AtomicBool, calls: &AtomicU64) {
             1 => open.check(&own).map(drop),
             2 => open.sessions().map(drop),
             3 => open.describe().map(drop),
-            4 => open.run(&RunParams { plan: own, ..RunParams::default() }).map(drop),
+            4 if begun.load(Ordering::Relaxed) => {
+                open.run(&RunParams { plan: own, ..RunParams::default() }).map(drop)
+            }
             _ => open.status().map(drop),
         };
         calls.fetch_add(1, Ordering::Relaxed);

@@ -97,8 +97,12 @@ impl Lab {
 
     /// Starts a run and waits until the mirror has played a number of samples with light.
     fn play(&self, count: u32, samples: usize) -> Process {
+        self.play_plan(plan(count), samples)
+    }
+
+    fn play_plan(&self, plan: String, samples: usize) -> Process {
         let daemon = self.daemon();
-        let params = RunParams { plan: plan(count), ..RunParams::default() };
+        let params = RunParams { plan, ..RunParams::default() };
         self.client().run(&params).unwrap();
         let began = Instant::now();
         while self.lit() < samples {
@@ -126,8 +130,31 @@ impl Lab {
         }
     }
 
+    /// What a batch of [`plan`] is on the wire.
+    fn codes(&self) -> Vec<Held> {
+        let rig =
+            DotRigFile::parse(&fs::read_to_string(self.folder.path().join("rig.toml")).unwrap()).unwrap();
+        let Procedure::Batches(plan) = Plan::parse(&plan(1)).unwrap().procedure else { panic!("batches") };
+        let path = plan.mirror_path(&rig.limits()).unwrap();
+        let samples =
+            path.points().iter().map(|point| MirrorSample::of(*point, MirrorLimits::A7B2_3_3600AL.max_tilt));
+        samples.map(|MirrorSample { x, y, light }| Held { x: f64::from(x), y: f64::from(y), light }).collect()
+    }
+
     /// Waits until the light is off and then the mirror is parked, without any step on the way; prints the times.
     fn assert_parked(&self, way: &str, since_ns: i64) {
+        self.assert_parked_with_steps(way, since_ns, MAX_STEP_CODES);
+    }
+
+    /// The same after the end of a process that played [`plan`]: if it died within a write, the place from which the
+    /// mirror is taken to its origin is known to half a write, or 32 samples.
+    fn assert_parked_after_kill(&self, way: &str, since_ns: i64) {
+        let half_a_write =
+            self.codes().windows(33).map(|held| step_codes(&held[0], &held[32])).fold(0.0, f64::max);
+        self.assert_parked_with_steps(way, since_ns, half_a_write.max(MAX_STEP_CODES));
+    }
+
+    fn assert_parked_with_steps(&self, way: &str, since_ns: i64, most_codes: f64) {
         let began = Instant::now();
         let (dark_ns, parked_ns) = loop {
             let parked = self.pty.look(|truth| truth.dark_since_ns.zip(truth.parked_since_ns));
@@ -138,13 +165,10 @@ impl Lab {
             std::thread::sleep(Duration::from_millis(2));
         };
         assert!(dark_ns <= parked_ns);
-        let truth = self.pty.truth();
-        let steps = truth
-            .held
-            .windows(2)
-            .map(|pair| (pair[1].x - pair[0].x).abs().max((pair[1].y - pair[0].y).abs()));
-        let step = steps.fold(0.0, f64::max);
-        let allowed = MirrorLimits::A7B2_3_3600AL.max_step.0 / 6.5 * 2047.0 + 2.0;
+        let held = self.pty.truth().held;
+        let step = held.windows(2).map(|pair| step_codes(&pair[0], &pair[1])).fold(0.0, f64::max);
+        // Two codes: rounding at both ends.
+        let allowed = most_codes + 2.0;
         assert!(step <= allowed, "{way}: a step of {step} codes, {allowed} are allowed");
         let ms = |ns: i64| (ns - since_ns) as f64 / 1e6;
         println!("{way}: light off after {:.1} ms, mirror parked after {:.1} ms", ms(dark_ns), ms(parked_ns));
@@ -164,6 +188,13 @@ impl Lab {
     }
 }
 
+/// The longest step between two samples that the mirror may be asked for.
+const MAX_STEP_CODES: f64 = MirrorLimits::A7B2_3_3600AL.max_step.0 / 6.5 * 2047.0;
+
+fn step_codes(from: &Held, to: &Held) -> f64 {
+    (to.x - from.x).abs().max((to.y - from.y).abs())
+}
+
 fn now_ns() -> i64 {
     Clock::real().now_ns()
 }
@@ -174,8 +205,7 @@ fn sixty_batches_reach_the_mirror_bit_for_bit() {
     let _daemon = lab.daemon();
     let events = lab.client().subscribe().unwrap();
     // Two more batches are played than requested, because the first one has no beginning.
-    let text = plan(58);
-    lab.client().run(&RunParams { plan: text.clone(), ..RunParams::default() }).unwrap();
+    lab.client().run(&RunParams { plan: plan(58), ..RunParams::default() }).unwrap();
     let finished = events.into_iter().find_map(|event| match event.unwrap() {
         Event::Finished { state, error, .. } => Some((state, error)),
         _ => None,
@@ -183,16 +213,8 @@ fn sixty_batches_reach_the_mirror_bit_for_bit() {
     assert_eq!(finished, Some(("complete".into(), None)), "{}", lab.log());
     let truth = lab.pty.truth();
     assert_eq!((truth.underruns, truth.overfills), (0, 0));
-    let rig = DotRigFile::parse(&fs::read_to_string(lab.folder.path().join("rig.toml")).unwrap()).unwrap();
-    let Procedure::Batches(plan) = Plan::parse(&text).unwrap().procedure else { panic!("batches") };
-    let path = plan.mirror_path(&rig.limits()).unwrap();
-    assert_eq!(path.points().len(), 6500);
-    let codes: Vec<Held> = path
-        .points()
-        .iter()
-        .map(|point| MirrorSample::of(*point, MirrorLimits::A7B2_3_3600AL.max_tilt))
-        .map(|MirrorSample { x, y, light }| Held { x: f64::from(x), y: f64::from(y), light })
-        .collect();
+    let codes = lab.codes();
+    assert_eq!(codes.len(), 6500);
     let first = codes.iter().position(|held| held.light > 0).unwrap();
     let begin = truth.held.iter().position(|held| held.light > 0).unwrap() - first;
     assert!(truth.held.len() >= begin + 390_000);
@@ -287,7 +309,7 @@ fn sigkill() {
     let since_ns = now_ns();
     daemon.signal(Signal::SIGKILL);
     daemon.wait();
-    lab.assert_parked("SIGKILL, by the guardian", since_ns);
+    lab.assert_parked_after_kill("SIGKILL, by the guardian", since_ns);
     lab.assert_noted();
 }
 
@@ -344,4 +366,39 @@ fn no_light_without_a_word() {
     assert_eq!(state, RunState::Faulted);
     assert!(error.unwrap().contains("close the enclosure"));
     assert_eq!(lab.lit(), 0);
+}
+
+/// A viewfinder holds the dot aside. Whatever ends it, the light goes off before the mirror returns.
+#[test]
+fn viewfinder() {
+    let plan = || "kind = \"viewfinder\"\n[viewfinder]\ntilt_deg = [2.0, -1.0]\n".to_owned();
+    let lab = Lab::new();
+    let daemon = lab.play_plan(plan(), 5000);
+    let since_ns = now_ns();
+    lab.client().cancel().unwrap();
+    lab.assert_parked("viewfinder cancelled", since_ns);
+    assert_eq!(lab.ended(), (RunState::Idle, None));
+    drop(daemon);
+
+    let lab = Lab::new();
+    let _daemon = lab.play_plan(plan(), 5000);
+    let since_ns = now_ns();
+    fs::write(lab.folder.path().join("interlock"), "0\n").unwrap();
+    lab.assert_parked("viewfinder, interlock opened", since_ns);
+    let (state, error) = lab.ended();
+    assert_eq!(state, RunState::Faulted);
+    assert!(error.unwrap().contains("interlock"));
+    // It gets no light either if it begins like this.
+    let lit = lab.lit();
+    lab.client().run(&RunParams { plan: plan(), ..RunParams::default() }).unwrap();
+    assert!(lab.ended().1.unwrap().contains("close the enclosure"));
+    assert_eq!(lab.lit(), lit);
+
+    let lab = Lab::new();
+    let mut daemon = lab.play_plan(plan(), 5000);
+    let since_ns = now_ns();
+    daemon.signal(Signal::SIGTERM);
+    lab.assert_parked("viewfinder, SIGTERM", since_ns);
+    assert!(daemon.wait().success(), "{}", lab.log());
+    lab.assert_noted();
 }

@@ -5,5 +5,6 @@ pub mod camera;
 pub mod mirror;
 pub mod projector;
 mod reopen;
+pub mod search;
 pub mod serial;
 pub mod vsync;

@@ -182,17 +182,25 @@ impl PlaneCamera {
         let (_, width) = self.world.size;
         let exposure_us = exposure.settings.exposure_us;
         let subject = exposure.subject;
+        // The light as the projector's lens lets it pass now, with the times at which it begins.
+        let lights: Vec<_> = lights
+            .iter()
+            .filter_map(|light| {
+                let optics = self.world.optics(light.shown.as_ref()?, subject)?;
+                Some((light, optics))
+            })
+            .collect();
         for (t, row) in self.light.chunks_mut(width).enumerate().skip(first_row) {
             let row_start_us = self.world.row_start_us(exposure.settings.shutter, t - first_row);
             let is_capped = subject == Subject::Cap;
             row.fill(if is_capped { 0.0 } else { self.world.ambient(exposure, row_start_us) });
-            for light in lights {
-                if let Some(optics) = light.shown.as_ref().and_then(|shown| shown.optics(subject, light.key))
-                {
-                    let from_us = us_from_ns(exposure.start_ns - light.start_ns) + row_start_us;
-                    optics.expose_row(t, from_us, from_us + exposure_us, row);
-                }
+            for (light, optics) in &lights {
+                let from_us = us_from_ns(exposure.start_ns - light.start_ns) + row_start_us;
+                optics[light.key % optics.len()].expose_row(t, from_us, from_us + exposure_us, row);
             }
+        }
+        if let (_, Some(disc)) = self.world.camera_lens.now() {
+            disc.blur(&mut self.light, width);
         }
         let exposed = SensorExposure { light: &mut self.light, exposure_us, key: exposure.key };
         self.world.sensor.read(exposed, &mut self.counts);

@@ -100,7 +100,7 @@ pub enum SimError {
     },
     /// The pattern varies along rows, which the scene's row transport cannot represent.
     #[error(
-        "a scene is simulated under patterns that are the same along rows, and a built-in one under columns too: for other patterns put the board before the camera"
+        "this scene is known by its rows alone, and cannot be lit by a pattern that varies along them: take a built-in scene or a pattern of rows, or put the board before the camera"
     )]
     AlongRows,
     /// A picture from a file.

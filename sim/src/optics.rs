@@ -3,18 +3,17 @@
 //! Light is integrated in time, row by row as the projector draws, continuously within a row (finer than any time
 //! grid). This code shares nothing with demultiplexing or its matrix, so that it can serve as an independent check.
 
-use ndarray::{Array2, Array3, Array4, ArrayView4, Axis, s};
+use ndarray::{Array2, Array3, Axis, s};
 use rayon::prelude::*;
 use raysweep_config::sim::{RowTable, SimBeam, SimBoard, SimProjector, SimSpot};
 use raysweep_core::{Mosaic, Pattern, Raster};
 
+use crate::drawn::{DrawnRows, PROJECTOR_COLUMNS, transports};
 use crate::error::SimError;
 use crate::keyed::{Purpose, keyed, uniform};
-use crate::scene::{Scene, SceneError};
+use crate::lens::DefocusDisc;
+use crate::scene::Scene;
 use crate::truth::PlaneTruth;
-
-/// Columns of the projector's picture.
-const PROJECTOR_COLUMNS: usize = 1280;
 
 /// What all subjects of a rig have in common: how the projector draws, and what the camera sees of it.
 pub struct View<'a> {
@@ -26,6 +25,8 @@ pub struct View<'a> {
     pub seed: u64,
     /// Colours of the camera's pixels.
     pub mosaic: Mosaic,
+    /// What the projector's lens makes of a point; `None`: a point.
+    pub disc: Option<&'a DefocusDisc>,
 }
 
 /// A subject under a raster projector, prepared so that an exposure takes two look-ups per camera row.
@@ -71,30 +72,31 @@ impl RasterOptics {
     /// # Errors
     /// When the pattern does not fit the projector or the scene, or when rows would be drawn in a different order.
     pub fn of_scene(scene: &Scene, view: &View<'_>, pattern: &Pattern) -> Result<Self, SimError> {
-        let &View { truth, projector, seed, mosaic } = view;
+        let &View { truth, projector, seed, mosaic, disc } = view;
         let raster = &truth.raster;
-        let (mut transport, pattern) = match pattern.row_weights(raster.rows)? {
-            Some(weights) => (filtered(scene.transport.view(), mosaic), weights),
-            None => {
-                let columns = pattern.column_weights(PROJECTOR_COLUMNS)?.ok_or(SimError::AlongRows)?;
-                (filtered(under_columns(scene, &columns)?.view(), mosaic), vec![1.0; raster.rows])
-            }
-        };
-        let (rows, height, width) = transport.dim();
+        let drawn = DrawnRows::new(pattern, raster.rows, disc)?;
+        let mut transports = transports(scene, &drawn.kinds, mosaic)?;
+        let (rows, height, width) = transports[0].dim();
         let table = row_table(raster, &projector.row_table, seed)?;
-        let kernel = Kernel::new(&projector.beam, raster.rows)?;
+        let kernel = Kernel::new(&projector.beam, raster.rows)?.through(disc);
 
         let flashes = match projector.spot {
             SimSpot::Uniform => None,
             SimSpot::OneWay | SimSpot::Bidirectional => {
-                let mut direct = Array2::zeros((height, width));
-                for t in 0..height.min(rows) {
-                    direct.row_mut(t).assign(&transport.slice(s![t, t, ..]));
-                    // Direct light of a moving spot is not spread over the row's dwell.
-                    transport.slice_mut(s![t, t, ..]).fill(0.0);
-                }
+                let own_row = |transport: &mut Array3<f32>| {
+                    let mut direct = Array2::<f32>::zeros((height, width));
+                    for t in 0..height.min(rows) {
+                        direct.row_mut(t).assign(&transport.slice(s![t, t, ..]));
+                        // Direct light of a moving spot is not spread over the row's dwell.
+                        transport.slice_mut(s![t, t, ..]).fill(0.0);
+                    }
+                    direct
+                };
+                let direct: Vec<Array2<f32>> = transports.iter_mut().map(own_row).collect();
                 let unspread = &[(0, 1.0)];
-                let own = OwnLight::new(view, &kernel, unspread, |t, s| direct[[t, s]], |v, _| pattern[v]);
+                let own = OwnLight::new(view, &kernel, unspread, |row, t, s| {
+                    drawn.weights[row] * direct[drawn.kind_of[row]][[t, s]]
+                });
                 let column = scene.projector_column.clone().unwrap_or_else(|| {
                     Array2::from_shape_fn((height, width), |(_, s)| (s as f32 + 0.5) / width as f32)
                 });
@@ -102,8 +104,9 @@ impl RasterOptics {
             }
         };
 
-        let (transport, rows_up) = shifted(transport, truth);
-        let rows = transport.len_of(Axis(0));
+        let (transports, rows_up): (Vec<_>, Vec<_>) =
+            transports.into_iter().map(|transport| shifted(transport, truth)).unzip();
+        let (rows, rows_up) = (transports[0].len_of(Axis(0)), rows_up[0]);
         let first_row = truth.first_row.saturating_add_signed(-rows_up);
         let beam_rows = kernel.reach_rows();
         let first_drawn = first_row.saturating_sub(beam_rows);
@@ -113,10 +116,11 @@ impl RasterOptics {
         cumulative.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(t, mut light)| {
             let mut sum = vec![0.0_f64; width];
             for (v, row) in (first_drawn..end_drawn).enumerate() {
+                let transport = &transports[drawn.kind_of[row]];
                 for (offset, share) in kernel.of_row(row) {
                     let lit = v.checked_add_signed(offset).and_then(|lit| lit.checked_sub(scene_offset));
                     let Some(lit) = lit.filter(|&lit| lit < rows) else { continue };
-                    let weight = f64::from(share * pattern[row]);
+                    let weight = f64::from(share * drawn.weights[row]);
                     for (s, sum) in sum.iter_mut().enumerate() {
                         *sum += weight * f64::from(transport[[lit, t, s]]);
                     }
@@ -136,24 +140,30 @@ impl RasterOptics {
     /// # Errors
     /// When the pattern does not fit the projector, or when rows would be drawn in a different order.
     pub fn of_board(board: &SimBoard, view: &View<'_>, pattern: &Pattern) -> Result<Self, SimError> {
-        let &View { truth, projector, seed, .. } = view;
+        let &View { truth, projector, seed, disc, .. } = view;
         let (raster, (_, width)) = (&truth.raster, truth.size());
         let table = row_table(raster, &projector.row_table, seed)?;
-        let kernel = Kernel::new(&projector.beam, raster.rows)?;
+        let kernel = Kernel::new(&projector.beam, raster.rows)?.through(disc);
         let [left, right] = board.projector_columns;
         let column = |x: f64| left + (right - left) * x / width as f64;
         let seen: Array2<f32> = match pattern.row_weights(raster.rows)? {
             Some(weights) => Array2::from_shape_fn((raster.rows, width), |(v, _)| weights[v]),
             None => {
                 let size = (PROJECTOR_COLUMNS, raster.rows);
-                let weights = pattern.pixel_weights(size)?.ok_or(SimError::Picture)?;
+                let mut weights = pattern.pixel_weights(size)?.ok_or(SimError::Picture)?;
+                if let Some(disc) = disc {
+                    weights = weights
+                        .par_chunks(PROJECTOR_COLUMNS)
+                        .flat_map_iter(|row| disc.blur_line(row))
+                        .collect();
+                }
                 Array2::from_shape_fn((raster.rows, width), |(v, s)| {
                     let row = &weights[v * PROJECTOR_COLUMNS..][..PROJECTOR_COLUMNS];
                     mean_over(row, column(s as f64), column(s as f64 + 1.0))
                 })
             }
         };
-        let own = OwnLight::new(view, &kernel, &spread_inside(board), |_, _| 1.0, |v, s| seen[[v, s]]);
+        let own = OwnLight::new(view, &kernel, &spread_inside(board), |row, _, s| seen[[row, s]]);
         if projector.spot != SimSpot::Uniform {
             let column = Array2::from_shape_fn(truth.size(), |(_, s)| column(s as f64 + 0.5) as f32);
             let flashes = Some(Flashes::new(own, column, &table, projector.spot));
@@ -251,14 +261,12 @@ impl Flashes {
 }
 
 impl OwnLight {
-    /// Light of pixels that send on `albedo` (t, s) of the light at their places, under weights of (projector row, s).
-    /// A pixel sees one row's height about its place, and `inside` the subject light spreads over rows.
+    /// Light of pixels that send on `sent` (projector row, t, s) of that at their places. A pixel sees one row's height about its place, and `inside` the subject light spreads over rows.
     fn new(
         view: &View<'_>,
         kernel: &Kernel,
         inside: &[(isize, f32)],
-        albedo: impl Fn(usize, usize) -> f32 + Sync,
-        weight: impl Fn(usize, usize) -> f32 + Sync,
+        sent: impl Fn(usize, usize, usize) -> f32 + Sync,
     ) -> Self {
         let &View { truth, .. } = view;
         let (rows, (height, width)) = (truth.raster.rows, truth.size());
@@ -280,7 +288,7 @@ impl OwnLight {
                     let row = first_of(t) + v;
                     let mut sum = 0.0;
                     for (offset, share) in kernel.of_row(row) {
-                        sum += share * seen.share(row as isize + offset) * weight(row, s) * albedo(t, s);
+                        sum += share * seen.share(row as isize + offset) * sent(row, t, s);
                     }
                     light[[v, s]] = sum;
                 }
@@ -351,26 +359,6 @@ fn shifted(transport: Array3<f32>, truth: &PlaneTruth) -> (Array3<f32>, isize) {
     (seen, up)
 }
 
-/// The images `[V, H, W, C]` of a scene under each row alone, lit with the weights of its columns.
-fn under_columns(scene: &Scene, columns: &[f32]) -> Result<Array4<f32>, SimError> {
-    let mut images = Array4::zeros(scene.transport.dim());
-    images
-        .axis_iter_mut(Axis(0))
-        .into_par_iter()
-        .enumerate()
-        .try_for_each(|(v, mut image)| {
-            let mut lit = Array2::zeros((scene.rows(), columns.len()));
-            lit.row_mut(v).iter_mut().zip(columns).for_each(|(lit, &weight)| *lit = weight);
-            image.assign(&scene.render(lit.view(), &scene.full_window())?);
-            Ok::<(), SceneError>(())
-        })
-        .map_err(|error| match error {
-            SceneError::RowsOnly { .. } => SimError::AlongRows,
-            other => other.into(),
-        })?;
-    Ok(images)
-}
-
 /// Mean of a row's weights between two of its columns, 0..1 over its width.
 fn mean_over(row: &[f32], from: f64, to: f64) -> f32 {
     let place = |column: f64| (column * row.len() as f64).clamp(0.0, row.len() as f64);
@@ -400,27 +388,6 @@ fn spread_inside(board: &SimBoard) -> Vec<(isize, f32)> {
             (d, (stays + scatter_share * scattered(d) / total) as f32)
         })
         .collect()
-}
-
-/// The transport as seen by the sensor's pixels, `[V, H, W]`: through a Bayer mosaic or, on a monochrome sensor, the
-/// mean of the colours.
-fn filtered(transport: ArrayView4<'_, f32>, mosaic: Mosaic) -> Array3<f32> {
-    let channels = transport.dim().3;
-    if channels == 1 {
-        return transport.index_axis(Axis(3), 0).to_owned();
-    }
-    let Some((red_s, red_t)) = mosaic.red() else {
-        return transport.sum_axis(Axis(3)) / channels as f32;
-    };
-    let (rows, height, width, _) = transport.dim();
-    let mut seen = Array3::zeros((rows, height, width));
-    for (first_t, first_s) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
-        // Blue is diagonal to red; green is adjacent to both.
-        let channel = (first_t ^ red_t) + (first_s ^ red_s);
-        seen.slice_mut(s![.., first_t..;2, first_s..;2])
-            .assign(&transport.index_axis(Axis(3), channel).slice(s![.., first_t..;2, first_s..;2]));
-    }
-    seen
 }
 
 /// Projector row of the scene's first row: `given`, or a value that centres the camera's rows, `row_pitch` projector rows
@@ -533,6 +500,25 @@ impl Kernel {
             weights.into_iter().map(|share| (share / total) as f32).collect()
         };
         Ok(Self { offsets, ends: [shares(top), shares(bottom)], rows })
+    }
+
+    /// The same light through a lens that is not in focus.
+    fn through(self, disc: Option<&DefocusDisc>) -> Self {
+        let Some(disc) = disc else { return self };
+        let profile: Vec<(isize, f64)> = disc.profile().collect();
+        let beam = self.reach_rows() as isize;
+        let lens = profile.iter().map(|(offset, _)| offset.abs()).max().unwrap_or(0);
+        let offsets: Vec<isize> = (-beam - lens..=beam + lens).collect();
+        let spread = |shares: &Vec<f32>| {
+            let mut spread = vec![0.0; offsets.len()];
+            for (offset, share) in self.offsets.iter().zip(shares) {
+                for (further, part) in &profile {
+                    spread[(offset + further + beam + lens) as usize] += share * *part as f32;
+                }
+            }
+            spread
+        };
+        Self { ends: self.ends.each_ref().map(spread), offsets, rows: self.rows }
     }
 
     /// The most rows over which a row's light spreads to either side.

@@ -8,6 +8,7 @@ use raysweep_core::{Clock, Pattern, Shutter, Subject};
 
 use crate::devices::{self, PlaneDevices};
 use crate::error::SimError;
+use crate::lens::Lens;
 use crate::line::VsyncLine;
 use crate::optics;
 use crate::scene::{Scene, SceneMotion, SceneSize};
@@ -17,6 +18,29 @@ use crate::truth::{PlaneTruth, Stated};
 use crate::wire::{self, WireDevices};
 use crate::world::{PlaneSetup, PlaneWorld};
 use raysweep_config::sim::SimConfig;
+
+/// One of a rig's lenses.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LensOf {
+    /// The camera's.
+    Camera,
+    /// The projector's.
+    Projector,
+}
+
+/// Turns the lenses of a simulated rig, also during a run. For tests only: real lenses are turned by hand.
+#[derive(Clone)]
+pub struct LensControl(Arc<PlaneWorld>);
+
+impl LensControl {
+    /// Turns a lens's focus ring to this position, for frames that are rendered from now on.
+    pub fn turn(&self, lens: LensOf, position_mm: f64) {
+        match lens {
+            LensOf::Camera => self.0.camera_lens.turn(position_mm),
+            LensOf::Projector => self.0.projector_lens.turn(position_mm),
+        }
+    }
+}
 
 /// A simulated plane rig, whose devices can be opened repeatedly.
 pub struct PlaneRig {
@@ -62,6 +86,8 @@ impl PlaneRig {
         let scale = Scale { white_dn: truth.white_dn, black_dn: truth.black_dn, bits: setup.format.bits() };
         let sensor = ImageSensor::new(&config.sensor, size, scale, config.seed);
         let world = PlaneWorld {
+            camera_lens: Lens::new(config.camera.lens),
+            projector_lens: Lens::new(config.projector.lens),
             config,
             setup,
             scenes,
@@ -90,6 +116,11 @@ impl PlaneRig {
     /// What is true of the rig, for tests only.
     pub fn truth(&self) -> &PlaneTruth {
         &self.world.truth
+    }
+
+    /// Turns the lenses, also while devices are open; for tests only.
+    pub fn lenses(&self) -> LensControl {
+        LensControl(self.world.clone())
     }
 
     /// Projector row seen by camera row 0, as far as the rig file knows.
@@ -141,7 +172,8 @@ impl PlaneRig {
         let start_us = truth.raster.row_centre_us(truth.first_row) + delay_us - exposure_us / 2.0;
         let mut image = Array2::zeros(*size);
         self.world.prepare(white, Subject::Scene)?;
-        let Some(optics) = white.optics(Subject::Scene, motion.key(time_ns)) else { return Ok(image) };
+        let Some(optics) = self.world.optics(white, Subject::Scene) else { return Ok(image) };
+        let optics = &optics[motion.key(time_ns) % optics.len()];
         for (t, mut row) in image.rows_mut().into_iter().enumerate() {
             let mut light = vec![0.0; row.len()];
             let from_us = start_us + self.world.row_start_us(Shutter::Rolling, t);
@@ -169,6 +201,12 @@ fn check_ranges(config: &SimConfig) -> Result<(), SimError> {
         ("camera.readout_us", config.camera.readout_us.unwrap_or(0.0), not_negative),
         ("camera.exposure_step_us", config.camera.exposure_step_us, "0.001 to 1000"),
         ("camera.delay_step_us", config.camera.delay_step_us, "0.001 to 1000"),
+        ("camera.lens.depth_of_field_mm", config.camera.lens.depth_of_field_mm, "0.001 to 1000"),
+        ("projector.lens.depth_of_field_mm", config.projector.lens.depth_of_field_mm, "0.001 to 1000"),
+        ("camera.lens.position_mm", config.camera.lens.position_mm, "-8192 to 8192"),
+        ("camera.lens.focus_mm", config.camera.lens.focus_mm, "-8192 to 8192"),
+        ("projector.lens.position_mm", config.projector.lens.position_mm, "-8192 to 8192"),
+        ("projector.lens.focus_mm", config.projector.lens.focus_mm, "-8192 to 8192"),
         ("sensor.electrons_per_dn", config.sensor.electrons_per_dn, "more than 0"),
         ("sensor.full_well_e", config.sensor.full_well_e, "more than 0"),
         ("sensor.read_noise_e", config.sensor.read_noise_e, not_negative),

@@ -1,6 +1,6 @@
 //! What the projector shows, and the light that reaches the camera of it.
 
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, PoisonError, RwLock};
 
 use raysweep_core::{Pattern, Subject};
 
@@ -10,21 +10,38 @@ use crate::optics::RasterOptics;
 pub struct ShownOptics {
     pub pattern: Pattern,
     /// The scene in each key position of its motion.
-    pub scene: OnceLock<Arc<[RasterOptics]>>,
-    pub board: OnceLock<RasterOptics>,
+    scene: Prepared,
+    /// The board alone.
+    board: Prepared,
 }
+
+/// A subject under a pattern, with the position of the projector's lens that it was computed for.
+#[derive(Default)]
+struct Prepared(RwLock<Option<(f64, Arc<[RasterOptics]>)>>);
 
 impl ShownOptics {
     pub fn new(pattern: Pattern) -> Self {
-        Self { pattern, scene: OnceLock::new(), board: OnceLock::new() }
+        Self { pattern, scene: Prepared::default(), board: Prepared::default() }
     }
 
-    /// The subject under the pattern; `None`: no light.
-    pub fn optics(&self, subject: Subject, key: usize) -> Option<&RasterOptics> {
+    fn of(&self, subject: Subject) -> Option<&Prepared> {
         match subject {
-            Subject::Scene => self.scene.get().map(|keys| &keys[key]),
-            Subject::Board => self.board.get(),
+            Subject::Scene => Some(&self.scene),
+            Subject::Board => Some(&self.board),
             Subject::Cap | Subject::Plane(_) | Subject::Diffuser => None,
+        }
+    }
+
+    /// The subject under the pattern, in each key position, and the lens position that it was computed for; `None`: no
+    /// light.
+    pub fn optics(&self, subject: Subject) -> Option<(f64, Arc<[RasterOptics]>)> {
+        self.of(subject)?.0.read().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Keeps what was computed of a subject.
+    pub fn keep(&self, subject: Subject, lens_mm: f64, optics: Arc<[RasterOptics]>) {
+        if let Some(prepared) = self.of(subject) {
+            *prepared.0.write().unwrap_or_else(PoisonError::into_inner) = Some((lens_mm, optics));
         }
     }
 }

@@ -7,6 +7,7 @@ use raysweep_core::{CameraCapabilities, Pattern, PixelFormat, Raster, Shutter, S
 
 use crate::error::SimError;
 use crate::keyed::{Purpose, keyed, uniform};
+use crate::lens::Lens;
 use crate::line::{Exposure, LineConfig};
 use crate::optics::{RasterOptics, View};
 use crate::scene::{Scene, SceneMotion};
@@ -46,6 +47,8 @@ pub(crate) struct PlaneWorld {
     pub size: (usize, usize),
     pub format: PixelFormat,
     pub sensor: ImageSensor,
+    pub camera_lens: Lens,
+    pub projector_lens: Lens,
     /// What a white picture shows, which is shown in every run.
     pub white: Arc<ShownOptics>,
 }
@@ -61,25 +64,41 @@ impl PlaneWorld {
         Ok(shown)
     }
 
-    /// Computes the light of a subject under what is shown, unless that is done.
+    /// Computes the light of a subject under what is shown, unless that is done for the lens as it is.
     pub fn prepare(&self, shown: &ShownOptics, subject: Subject) -> Result<(), SimError> {
         let Self { config, truth, .. } = self;
-        let view =
-            View { truth, projector: &config.projector, seed: config.seed, mosaic: self.format.mosaic };
-        match subject {
-            Subject::Scene if shown.scene.get().is_none() => {
-                let optics = |scene| RasterOptics::of_scene(scene, &view, &shown.pattern);
-                let keys =
-                    self.scenes.iter().map(optics).collect::<Result<Arc<[RasterOptics]>, SimError>>()?;
-                shown.scene.get_or_init(|| keys);
-            }
-            Subject::Board if shown.board.get().is_none() => {
-                let optics = RasterOptics::of_board(&config.board, &view, &shown.pattern)?;
-                shown.board.get_or_init(|| optics);
-            }
-            _ => {}
+        let (lens_mm, disc) = self.projector_lens.now();
+        if shown.optics(subject).is_some_and(|(prepared_mm, _)| prepared_mm == lens_mm) {
+            return Ok(());
         }
+        let view = View {
+            truth,
+            projector: &config.projector,
+            seed: config.seed,
+            mosaic: self.format.mosaic,
+            disc: disc.as_deref(),
+        };
+        let optics = match subject {
+            Subject::Scene => {
+                let optics = |scene| RasterOptics::of_scene(scene, &view, &shown.pattern);
+                self.scenes.iter().map(optics).collect::<Result<Arc<[RasterOptics]>, SimError>>()?
+            }
+            Subject::Board => [RasterOptics::of_board(&config.board, &view, &shown.pattern)?].into(),
+            Subject::Cap | Subject::Plane(_) | Subject::Diffuser => return Ok(()),
+        };
+        shown.keep(subject, lens_mm, optics);
         Ok(())
+    }
+
+    /// The light of a subject under what is shown, through the projector's lens as it is now; `None`: no light.
+    pub fn optics(&self, shown: &ShownOptics, subject: Subject) -> Option<Arc<[RasterOptics]>> {
+        let (lens_mm, _) = self.projector_lens.now();
+        let (prepared_mm, optics) = shown.optics(subject)?;
+        // What could be computed for one position can be for all.
+        if prepared_mm == lens_mm || self.prepare(shown, subject).is_err() {
+            return Some(optics);
+        }
+        shown.optics(subject).map(|(_, optics)| optics)
     }
 
     /// Start of row `t`'s exposure relative to row 0.

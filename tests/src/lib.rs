@@ -197,7 +197,7 @@ impl Ended {
         let array = match state.session.shape.contents {
             Contents::Sweep { .. } => ArrayName::Sum,
             Contents::Darks { .. } => ArrayName::Dark,
-            Contents::Board { .. } => ArrayName::Sum,
+            Contents::Board { .. } | Contents::Patterns { .. } => ArrayName::Sum,
             Contents::Film { .. } => {
                 assert!(state.cycles().all(|cycle| cycle.counts.balanced()));
                 return self;
@@ -210,6 +210,7 @@ impl Ended {
                 assert!(state.axes().all(|axis| axis.counts.balanced()));
                 return self;
             }
+            Contents::Nothing => return self,
         };
         let (stored, missing) = (state.stored(array).count(), state.missing(array).count());
         assert_eq!(stored + missing, state.session.shape.points());

@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
+use raysweep::control::Control;
 use raysweep_processing::{Asked, ExportScope, copy_acquired, export, process, process_asked};
 use raysweep_session::Session;
 use raysweep_session::stack::ArrayName;
@@ -129,4 +130,46 @@ fn a_film_whose_transports_were_made_later_says_nothing_of_missing_ones() {
     process(&ended.session).unwrap();
     let report = fs::read_to_string(session.report_path()).unwrap();
     assert!(!report.contains("have no transport"));
+}
+
+#[test]
+fn a_sessions_own_rig_file_finds_what_the_rig_refers_to() {
+    let folder = tempfile::TempDir::new().unwrap();
+    let rigs = folder.path().join("rigs");
+    fs::create_dir(&rigs).unwrap();
+    fs::create_dir(folder.path().join("scenes")).unwrap();
+    fs::copy(raysweep_tests::data("p2r_corner.npz"), folder.path().join("scenes/corner.npz")).unwrap();
+    let rig = rig_text(128, "scene = \"../scenes/corner.npz\" # by others", "");
+    fs::write(rigs.join("rig.toml"), &rig).unwrap();
+    let start = |rig: &Path| {
+        let rig = raysweep::rig::Rig::load(rig).unwrap_or_else(|error| panic!("{error}"));
+        raysweep::Runner::new(rig, folder.path().join("sessions")).unwrap()
+    };
+    let plan = "kind = \"sweep\"\n[sweep]\naverage = 1\ndelay_us = [-300, 0, 300]\nexposure_us = [600]\n";
+    let runner = start(&rigs.join("rig.toml"));
+    let mut events = runner.events();
+    runner.run(raysweep_proto::RunParams { plan: plan.into(), ..Default::default() }).unwrap();
+    let session = raysweep_tests::end_of(&mut events).session;
+    runner.shut_down();
+    drop(runner);
+    let stored = fs::read_to_string(session.join("rig.toml")).unwrap();
+    let scene = folder.path().canonicalize().unwrap().join("scenes/corner.npz");
+    assert_eq!(
+        stored,
+        rig.replace("\"../scenes/corner.npz\"", &format!("{scene:?}")),
+        "nothing else changes"
+    );
+
+    // Both files resume the session; so does the original one, if an earlier version stored it as it was.
+    let resumed = |rig: &Path| {
+        let runner = start(rig);
+        let mut events = runner.events();
+        let ledger = session.join("ledger.jsonl");
+        let lines: Vec<String> = fs::read_to_string(&ledger).unwrap().lines().map(str::to_owned).collect();
+        fs::write(&ledger, lines[..lines.len() - 3].join("\n") + "\n").unwrap();
+        runner.resume(raysweep_proto::ResumeParams { session: session.clone() }).unwrap();
+        raysweep_tests::end_of(&mut events).state
+    };
+    assert_eq!(resumed(&session.join("rig.toml")), "complete");
+    assert_eq!(resumed(&rigs.join("rig.toml")), "complete");
 }

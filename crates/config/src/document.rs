@@ -245,6 +245,23 @@ impl Places {
         path.iter().try_fold(&self.root, |place, key| place.inside.get(*key)).is_some()
     }
 
+    /// `text`, of which these are the places, with other strings as the values at some paths of keys (for arrays,
+    /// indices). Everything else stays as it is; values that the text does not have are not added.
+    pub fn with_strings(&self, text: &str, strings: &[(Vec<String>, String)]) -> String {
+        let found = strings.iter().filter_map(|(path, string)| {
+            let place = path.iter().try_fold(&self.root, |place, key| place.inside.get(key.as_str()))?;
+            Some((place.value.clone(), string))
+        });
+        let mut found: Vec<_> = found.collect();
+        // From the end, so that spans stay true.
+        found.sort_by_key(|(span, _)| std::cmp::Reverse(span.start));
+        let mut text = text.to_owned();
+        for (span, string) in found.into_iter().filter(|(span, _)| !span.is_empty()) {
+            text.replace_range(span, &toml::Value::String(string.clone()).to_string());
+        }
+        text
+    }
+
     /// A mistake about the value at a path of keys (for arrays, indices). If the text has no such value, the mistake
     /// points to the deepest table on the way to it.
     pub fn mistake(&self, path: &[&str], message: impl Into<String>) -> ConfigMistake {

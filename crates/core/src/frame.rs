@@ -2,6 +2,7 @@
 
 use std::ops::{Deref, DerefMut};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use crate::PixelFormat;
 
@@ -83,6 +84,14 @@ impl FramePool {
             }
             free = self.shelf.returned.wait(free).unwrap_or_else(PoisonError::into_inner);
         }
+    }
+
+    /// As [`Self::take`], but gives up after `timeout`.
+    pub fn take_within(&self, timeout: Duration) -> Option<FrameBuf> {
+        let free = self.shelf.lock();
+        let waited = self.shelf.returned.wait_timeout_while(free, timeout, |free| free.is_empty());
+        let (mut free, _) = waited.unwrap_or_else(PoisonError::into_inner);
+        Some(self.lend(free.pop()?))
     }
 
     /// A buffer of the pool's size that does not belong to the pool: for a frame that has to be received but cannot
@@ -189,7 +198,9 @@ mod tests {
             let pool = pool.clone();
             move || pool.take().len()
         });
+        assert!(pool.take_within(Duration::ZERO).is_none());
         drop(lent);
         assert_eq!(waiter.join().unwrap(), 1);
+        assert!(pool.take_within(Duration::ZERO).is_some());
     }
 }

@@ -19,6 +19,7 @@ mod raster;
 mod subject;
 mod texts;
 mod units;
+mod viewfinder;
 
 pub use clock::{Clock, ClockHandle};
 pub use clock_model::{ClockModel, ClockQuality, RoundTrip};
@@ -35,9 +36,10 @@ pub use mirror::{
     MAX_POINTS, MechanicalDeg, Mirror, MirrorCapabilities, MirrorLimits, MirrorPath, MirrorPoint,
     MirrorProgress, OpticalDeg, PathError, RasterScan, SecondOrder, Tilt,
 };
-pub use pattern::{Pattern, PatternError};
+pub use pattern::{Pattern, PatternError, PatternLines};
 pub use pixel::{Mosaic, Packing, PixelError, PixelFormat, UnknownPixelFormat, UnpackLevel};
 pub use raster::{Raster, Trigger};
 pub use subject::Subject;
 pub use texts::{Size, io_text};
 pub use units::{ns_from_us, us_from_ns};
+pub use viewfinder::FinderPicture;

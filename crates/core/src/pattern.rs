@@ -1,7 +1,11 @@
 //! What a projector shows.
 
+use std::f64::consts::TAU;
 use std::fmt;
 use std::path::PathBuf;
+
+/// Most steps by which a checkerboard is shifted by the side of a square.
+const MOST_STEPS: u32 = 32;
 
 /// What a projector shows. Rows and columns count from the top left of its picture.
 #[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
@@ -24,6 +28,11 @@ pub enum Pattern {
         cell_px: u32,
         /// Shift of the board to the right and down in pixels: (x, y).
         shift_px: (u32, u32),
+    },
+    /// A lit cross through the middle of the picture.
+    Cross {
+        /// Width of its bars in pixels, at least 1.
+        width_px: u32,
     },
     /// Every pixel at one level.
     Grey {
@@ -62,8 +71,46 @@ pub enum Pattern {
         /// Columns of a block.
         block: usize,
     },
+    /// Lit and dark bars, each half a period wide. Unshifted, the first line is lit.
+    Stripes {
+        /// From one lit bar to the next, at least 2.
+        period_px: u32,
+        /// Shift to higher lines in pixels.
+        phase_px: u32,
+        /// The lines that make up a bar.
+        lines: PatternLines,
+    },
+    /// A sinusoid over rows or columns: (1 + cos(2 pi (line / period - phase))) / 2.
+    Sinusoid {
+        /// From one maximum to the next, at least 2.
+        period_px: f32,
+        /// In periods, 0..=1.
+        phase: f32,
+        /// The lines over which it varies.
+        lines: PatternLines,
+    },
     /// A picture of the projector's size, from a PNG file.
     Image(PathBuf),
+}
+
+/// The lines of a picture that a pattern tells apart.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PatternLines {
+    /// Each row has one brightness.
+    #[default]
+    Rows,
+    /// Each column has one brightness.
+    Columns,
+}
+
+impl fmt::Display for PatternLines {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Rows => "rows",
+            Self::Columns => "columns",
+        })
+    }
 }
 
 /// What to show, for an operator: completes "make the projector show".
@@ -80,11 +127,21 @@ impl fmt::Display for Pattern {
                     "a checkerboard of squares of {cell_px} pixels, shifted by {x} to the right and {y} down"
                 )
             }
+            Self::Cross { width_px } => write!(f, "a cross of bars of {width_px} pixels"),
             Self::Grey { level } => write!(f, "a grey picture of level {level}"),
             Self::SparseRows { phase, period } => write_sparse(f, "rows", *phase, *period),
             Self::GrayRows { bit, inverse, block } => write_gray(f, "row", *bit, *inverse, *block),
             Self::SparseColumns { phase, period } => write_sparse(f, "columns", *phase, *period),
             Self::GrayColumns { bit, inverse, block } => write_gray(f, "column", *bit, *inverse, *block),
+            Self::Stripes { period_px, phase_px, lines } => {
+                write!(f, "stripes of {lines} with a period of {period_px} pixels, shifted by {phase_px}")
+            }
+            Self::Sinusoid { period_px, phase, lines } => {
+                write!(
+                    f,
+                    "a sinusoid over {lines} with a period of {period_px} pixels, shifted by {phase} periods"
+                )
+            }
             Self::Image(path) => write!(f, "the picture {}", path.display()),
         }
     }
@@ -130,6 +187,9 @@ pub enum PatternError {
     /// Squares of size zero.
     #[error("checkerboard with cell_px = 0: give at least 1")]
     Cell,
+    /// Bars of no width.
+    #[error("cross with width_px = 0: give at least 1")]
+    Bar,
     /// A level outside 0..=1.
     #[error("grey of level {0}: must be from 0 to 1")]
     Level(f32),
@@ -140,6 +200,20 @@ pub enum PatternError {
         phase: usize,
         /// From one lit row or column to the next.
         period: usize,
+    },
+    /// A period of less than two pixels.
+    #[error("period_px = {0}: must be at least 2")]
+    Period(f32),
+    /// A sinusoid's phase outside 0..=1.
+    #[error("phase = {0}: must be from 0 to 1, in periods")]
+    SinusoidPhase(f32),
+    /// A number of shifts that do not cover a checkerboard's period evenly.
+    #[error("shifts = {shifts}: a checkerboard with size_px = {size_px} can be shifted {} times", allowed_shifts(*size_px))]
+    Shifts {
+        /// The number asked for.
+        shifts: u32,
+        /// Side of a square.
+        size_px: u32,
     },
     /// A Gray code of blocks of no size, or of more bits than there are.
     #[error("Gray code with bit {bit} and blocks of {block}: give a bit up to 63 and blocks of at least 1")]
@@ -180,8 +254,13 @@ impl Pattern {
             Self::Grey { level } => Err(PatternError::Level(*level)),
             Self::SparseRows { phase, period } => sparse(*phase, *period, rows).map(Some),
             Self::GrayRows { bit, inverse, block } => gray(*bit, *inverse, *block, rows).map(Some),
+            Self::Stripes { lines: PatternLines::Rows, .. }
+            | Self::Sinusoid { lines: PatternLines::Rows, .. } => self.line_weights(rows).map(Some),
+            Self::Stripes { .. } | Self::Sinusoid { .. } => self.line_weights(1).map(|_| None),
             Self::Checkerboard { cell_px: 0, .. } => Err(PatternError::Cell),
-            Self::SparseColumns { .. }
+            Self::Cross { width_px: 0 } => Err(PatternError::Bar),
+            Self::Cross { .. }
+            | Self::SparseColumns { .. }
             | Self::GrayColumns { .. }
             | Self::Checkerboard { .. }
             | Self::Image(_) => Ok(None),
@@ -197,8 +276,48 @@ impl Pattern {
         match self {
             Self::SparseColumns { phase, period } => sparse(*phase, *period, columns).map(Some),
             Self::GrayColumns { bit, inverse, block } => gray(*bit, *inverse, *block, columns).map(Some),
+            Self::Stripes { lines: PatternLines::Columns, .. }
+            | Self::Sinusoid { lines: PatternLines::Columns, .. } => self.line_weights(columns).map(Some),
             _ => Ok(None),
         }
+    }
+
+    /// The weights of the lines of stripes or a sinusoid; of no lines for other patterns.
+    fn line_weights(&self, count: usize) -> Result<Vec<f32>, PatternError> {
+        match *self {
+            Self::Stripes { period_px, .. } if period_px < 2 => Err(PatternError::Period(period_px as f32)),
+            Self::Stripes { period_px, phase_px, .. } => {
+                let (period, phase) = (period_px as usize, (phase_px % period_px) as usize);
+                Ok((0..count).map(|at| f32::from(2 * ((at + period - phase) % period) < period)).collect())
+            }
+            Self::Sinusoid { period_px, .. } if !(period_px >= 2.0 && period_px.is_finite()) => {
+                Err(PatternError::Period(period_px))
+            }
+            Self::Sinusoid { phase, .. } if !(0.0..=1.0).contains(&phase) => {
+                Err(PatternError::SinusoidPhase(phase))
+            }
+            Self::Sinusoid { period_px, phase, .. } => {
+                let turns = |at: usize| at as f64 / f64::from(period_px) - f64::from(phase);
+                Ok((0..count).map(|at| (0.5 + 0.5 * (TAU * turns(at)).cos()) as f32).collect())
+            }
+            _ => Ok(Vec::new()),
+        }
+    }
+
+    /// Checkerboards of squares of `size_px`, shifted in even steps over their whole period, row of shifts after row: as
+    /// many different ones as there are `shifts`, which is twice the square of the number of steps to a square. At
+    /// least four steps are needed to see how sharp the edges are.
+    ///
+    /// # Errors
+    /// [`PatternError::Shifts`] for another number.
+    pub fn shifted_checkerboards(size_px: u32, shifts: u32) -> Result<Vec<Self>, PatternError> {
+        let steps = steps_of(size_px).find(|steps| 2 * steps * steps == shifts);
+        let Some(steps) = steps else { return Err(PatternError::Shifts { shifts, size_px }) };
+        let step_px = size_px / steps;
+        // A shift by a square to the right and one down changes nothing, so half of the shifts down suffice.
+        let shift = |y: u32| (0..2 * steps).map(move |x| (x * step_px, y * step_px));
+        let shifts = (0..steps).flat_map(shift);
+        Ok(shifts.map(|shift_px| Self::Checkerboard { cell_px: size_px, shift_px }).collect())
     }
 
     /// A weight in 0..=1 for each of a projector's pixels, row by row; `None` for a picture from a file.
@@ -213,6 +332,12 @@ impl Pattern {
         if let Some(weights) = self.column_weights(columns)? {
             return Ok(Some(weights.repeat(rows)));
         }
+        if let Self::Cross { width_px } = self {
+            let width = *width_px as usize;
+            let is_bar = |at: usize, count: usize| (2 * at + 1).abs_diff(count) < width.max(1);
+            let pixels = (0..rows).flat_map(|y| (0..columns).map(move |x| (x, y)));
+            return Ok(Some(pixels.map(|(x, y)| f32::from(is_bar(x, columns) || is_bar(y, rows))).collect()));
+        }
         let Self::Checkerboard { cell_px, shift_px } = self else { return Ok(None) };
         let cell = *cell_px as usize;
         // The checkerboard repeats after two cells, so shifts are taken modulo two cells.
@@ -221,6 +346,20 @@ impl Pattern {
         let pixel = |x, y| lit_half(x, shift_px.0) == lit_half(y, shift_px.1);
         let pixels = (0..rows).flat_map(|y| (0..columns).map(move |x| (x, y)));
         Ok(Some(pixels.map(|(x, y)| f32::from(pixel(x, y))).collect()))
+    }
+}
+
+/// The numbers of steps in which a checkerboard can be shifted by the side of a square.
+fn steps_of(size_px: u32) -> impl Iterator<Item = u32> {
+    (4..=size_px.min(MOST_STEPS)).filter(move |steps| size_px.is_multiple_of(*steps))
+}
+
+fn allowed_shifts(size_px: u32) -> String {
+    let allowed: Vec<String> = steps_of(size_px).map(|steps| (2 * steps * steps).to_string()).collect();
+    match allowed.as_slice() {
+        [] => "in no useful number of steps; give a multiple of 4 pixels".into(),
+        [only] => only.clone(),
+        [first @ .., last] => format!("{} or {last}", first.join(", ")),
     }
 }
 
@@ -284,6 +423,52 @@ mod tests {
     }
 
     #[test]
+    fn a_cross_has_bars_of_its_width_through_the_middle() {
+        let lit = |width_px, columns, rows| {
+            let pixels = Pattern::Cross { width_px }.pixel_weights((columns, rows)).unwrap().unwrap();
+            let lit = |x: usize, y: usize| pixels[y * columns + x] == 1.0;
+            let along = |count, at: &dyn Fn(usize) -> bool| (0..count).filter(|&i| at(i)).collect::<Vec<_>>();
+            (along(columns, &|x| lit(x, 0)), along(rows, &|y| lit(0, y)))
+        };
+        assert_eq!(lit(2, 8, 6), (vec![3, 4], vec![2, 3]));
+        assert_eq!(lit(4, 8, 6), (vec![2, 3, 4, 5], vec![1, 2, 3, 4]));
+        assert_eq!(lit(1, 7, 5), (vec![3], vec![2]));
+    }
+
+    #[test]
+    fn stripes_and_sinusoids_vary_over_their_lines_alone() {
+        let stripes = |lines| Pattern::Stripes { period_px: 4, phase_px: 1, lines };
+        assert_eq!(stripes(PatternLines::Rows).row_weights(6), Ok(Some(vec![0.0, 1.0, 1.0, 0.0, 0.0, 1.0])));
+        assert_eq!(stripes(PatternLines::Columns).row_weights(6), Ok(None));
+        assert_eq!(stripes(PatternLines::Columns).column_weights(3), Ok(Some(vec![0.0, 1.0, 1.0])));
+        let sinusoid = |phase| Pattern::Sinusoid { period_px: 4.0, phase, lines: PatternLines::Rows };
+        let weights = sinusoid(0.25).row_weights(4).unwrap().unwrap();
+        let expected = [0.5, 1.0, 0.5, 0.0];
+        assert!(weights.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{weights:?}");
+        assert_eq!(sinusoid(1.5).row_weights(4), Err(PatternError::SinusoidPhase(1.5)));
+        let thin = Pattern::Stripes { period_px: 1, phase_px: 0, lines: PatternLines::Columns };
+        assert_eq!(thin.row_weights(4), Err(PatternError::Period(1.0)));
+    }
+
+    #[test]
+    fn shifted_checkerboards_differ_and_light_each_pixel_half_of_the_time() {
+        let boards = Pattern::shifted_checkerboards(24, 128).unwrap();
+        let mut sum = vec![0.0; 60 * 50];
+        let mut seen: Vec<Vec<f32>> = Vec::new();
+        for board in &boards {
+            let weights = board.pixel_weights((60, 50)).unwrap().unwrap();
+            sum.iter_mut().zip(&weights).for_each(|(sum, weight)| *sum += weight);
+            assert!(!seen.contains(&weights), "{board:?} comes twice");
+            seen.push(weights);
+        }
+        assert_eq!((seen.len(), sum.iter().all(|&sum| sum == 64.0)), (128, true));
+        let error = Pattern::shifted_checkerboards(24, 100).unwrap_err().to_string();
+        assert!(error.contains("32, 72, 128, 288 or 1152"), "{error}");
+        assert!(Pattern::shifted_checkerboards(5, 8).unwrap_err().to_string().contains("50"));
+        assert!(Pattern::shifted_checkerboards(3, 8).unwrap_err().to_string().contains("multiple of 4"));
+    }
+
+    #[test]
     fn patterns_are_described_in_words() {
         for (pattern, words) in [
             (Pattern::White, "a white picture"),
@@ -293,6 +478,7 @@ mod tests {
                 Pattern::Checkerboard { cell_px: 8, shift_px: (4, 0) },
                 "a checkerboard of squares of 8 pixels, shifted by 4 to the right and 0 down",
             ),
+            (Pattern::Cross { width_px: 4 }, "a cross of bars of 4 pixels"),
             (Pattern::Grey { level: 0.5 }, "a grey picture of level 0.5"),
             (Pattern::SparseRows { phase: 3, period: 16 }, "rows 3, 19, 35, ... lit"),
             (Pattern::SparseColumns { phase: 0, period: 2 }, "columns 0, 2, 4, ... lit"),
@@ -318,6 +504,7 @@ mod tests {
             (Pattern::Rows(vec![1.0, 1.5, 0.0]), "weight 1.5 of row 1"),
             (Pattern::Rows(vec![1.0, 0.0, f32::NAN]), "weight NaN of row 2"),
             (Pattern::Checkerboard { cell_px: 0, shift_px: (0, 0) }, "cell_px = 0"),
+            (Pattern::Cross { width_px: 0 }, "width_px = 0"),
             (Pattern::Grey { level: 1.5 }, "level 1.5"),
             (Pattern::SparseRows { phase: 3, period: 3 }, "phase 3 and period 3"),
             (Pattern::SparseColumns { phase: 0, period: 0 }, "period 0"),

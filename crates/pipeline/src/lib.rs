@@ -31,7 +31,7 @@ pub use assembler::{
 };
 pub use calibrated::CalibrationDrift;
 pub use demux::{DEMUX, DemuxFold, DemuxOptions, PREDICTED_SHARE, Snapshot, Solved, SweepSummary};
-pub use edges::{EdgeTracker, Line};
+pub use edges::{EdgeTracker, Found, Line};
 pub use film::{Cycle, CycleOrder, FilmFrame, FilmSolver};
 pub use findings::{Findings, name as prior_name, rows_to_choose_by};
 pub use light::SeenLight;

@@ -13,7 +13,7 @@ use raysweep_session::{Result, Session, durable};
 use serde_json::json;
 
 use crate::plane::{KnownRig, PlaneTask, manifest};
-use crate::report::{accounts, subtitle};
+use crate::report::{accounts, named, page};
 use crate::stored::{Asked, ProcessError, Processed, Stored};
 
 /// Without light, a frame is as good a millisecond late.
@@ -220,12 +220,7 @@ fn report(
         ("camera", format!("{} × {} px", shape.columns, shape.rows)),
         ("frames lost", state.counts.lost_total().to_string()),
     ];
-    Report {
-        title: state.session.name.clone(),
-        subtitle: subtitle(state, session),
-        facts: facts.map(|(key, value)| (key.to_owned(), value)).to_vec(),
-        sections,
-    }
+    page(session, state, named(facts), sections)
 }
 
 /// Reprocesses stored dark images.

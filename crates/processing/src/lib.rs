@@ -10,6 +10,7 @@ mod export;
 pub mod film;
 pub mod memory;
 pub mod mirror_response;
+pub mod patterns;
 pub mod plane;
 mod report;
 pub mod response;
@@ -18,8 +19,10 @@ mod software;
 mod stored;
 pub mod sweep;
 mod video;
+pub mod viewfinder;
 
 use std::collections::BTreeMap;
+use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 
 use raysweep_config::{Plan, Procedure};
@@ -30,7 +33,7 @@ use raysweep_session::{Session, manifest};
 
 use self::stored::read;
 
-pub use export::{ExportScope, copy_acquired, export};
+pub use export::{ExportFormat, ExportScope, copy_acquired, export, export_as};
 pub use software::SOFTWARE;
 pub use stored::{Asked, ProcessError, Processed, Stored};
 
@@ -62,7 +65,7 @@ pub fn process_asked(dir: &Path, asked: &Asked) -> Result<Processed, ProcessErro
         return Err(ProcessError::Damaged { dir: dir.to_owned(), damage, is_edited });
     }
     ledger.leave_out(&damage);
-    let before = records_of(&session, &results)?;
+    let before = results_before(&session, &results)?;
     let mut processed = process_sound(&session, ledger.state(), asked)?;
     if torn_bytes > 0 {
         let torn = "the last line of ledger.jsonl was torn by a crash: what it recorded is not stored";
@@ -87,32 +90,53 @@ fn is_edited(session: &Session, damage: &[Damage], file: &str) -> bool {
     session.dir().join(file).exists() && damage.iter().any(|damage| damage.part == input(file))
 }
 
-/// Of damaged results that are there: what the manifest says of them, and what they are.
-fn records_of(session: &Session, damage: &[Damage]) -> Result<Vec<(String, [FileRecord; 2])>, ProcessError> {
+/// A damaged result before processing.
+struct DamagedResult {
+    file: String,
+    /// What the manifest says of it.
+    recorded: FileRecord,
+    written: Written,
+}
+
+/// Which writing of a file this is: every result is a new file when it is made again, even if its bytes are those that
+/// an earlier processing wrote and was killed before its manifest.
+#[derive(PartialEq)]
+struct Written {
+    inode: u64,
+    /// Seconds, and nanoseconds of the last one.
+    modified: (i64, i64),
+}
+
+impl Written {
+    /// Of a file, if it is there.
+    fn of(path: &Path) -> Option<Self> {
+        let metadata = path.metadata().ok()?;
+        let modified = (metadata.mtime(), metadata.mtime_nsec());
+        Some(Self { inode: metadata.ino(), modified })
+    }
+}
+
+/// The damaged results that are there.
+fn results_before(session: &Session, damage: &[Damage]) -> Result<Vec<DamagedResult>, ProcessError> {
     if damage.is_empty() {
         return Ok(Vec::new());
     }
     let recorded = manifest::read(session)?.files;
-    let mut records = Vec::new();
-    for damage in damage {
-        let DamagedPart::Result { file } = &damage.part else { continue };
-        let path = session.dir().join(file);
-        if let Some(record) = recorded.get(file).filter(|_| path.exists()) {
-            records.push((file.clone(), [record.clone(), FileRecord::read(&path)?]));
-        }
-    }
-    Ok(records)
+    let before = damage.iter().filter_map(|damage| {
+        let DamagedPart::Result { file } = &damage.part else { return None };
+        let written = Written::of(&session.dir().join(file))?;
+        Some(DamagedResult { file: file.clone(), recorded: recorded.get(file)?.clone(), written })
+    });
+    Ok(before.collect())
 }
 
 /// Keeps the manifest from certifying damaged results that were not made again.
-fn keep_damaged(session: &Session, before: Vec<(String, [FileRecord; 2])>) -> Result<(), ProcessError> {
-    let mut kept = BTreeMap::new();
-    for (file, [recorded, damaged]) in before {
-        let path = session.dir().join(&file);
-        if path.exists() && FileRecord::read(&path)? == damaged {
-            kept.insert(file, recorded);
-        }
-    }
+fn keep_damaged(session: &Session, before: Vec<DamagedResult>) -> Result<(), ProcessError> {
+    let is_kept = |before: &DamagedResult| {
+        Written::of(&session.dir().join(&before.file)).as_ref() == Some(&before.written)
+    };
+    let kept: BTreeMap<_, _> =
+        before.into_iter().filter(is_kept).map(|before| (before.file, before.recorded)).collect();
     if kept.is_empty() { Ok(()) } else { Ok(manifest::keep_records(session, &kept)?) }
 }
 
@@ -130,5 +154,7 @@ fn process_sound(session: &Session, state: &State, asked: &Asked) -> Result<Proc
         Procedure::Response(own) => response::process(&stored, own, asked),
         Procedure::Darks(own) => darks::process(&stored, own, asked),
         Procedure::Calibration(own) => calibration::process(&stored, own, asked),
+        Procedure::Patterns(own) => patterns::process(&stored, own, asked),
+        Procedure::Viewfinder(own) => viewfinder::process(&stored, own, asked),
     }
 }

@@ -3,10 +3,25 @@
 use raysweep_core::SettingsLatency;
 use raysweep_session::Session;
 use raysweep_session::ledger::State;
-use raysweep_session::report::{Block, NoteLevel, Table};
+use raysweep_session::report::{Block, NoteLevel, Report, Section, Table};
+
+/// The page of a session.
+pub(crate) fn page(
+    session: &Session,
+    state: &State,
+    facts: Vec<(String, String)>,
+    sections: Vec<Section>,
+) -> Report {
+    Report { title: state.session.name.clone(), subtitle: subtitle(state, session), facts, sections }
+}
+
+/// Facts with fixed names.
+pub(crate) fn named<const N: usize>(facts: [(&str, String); N]) -> Vec<(String, String)> {
+    facts.map(|(name, fact)| (name.to_owned(), fact)).to_vec()
+}
 
 /// Date, operator, sample, tags, note and folder of a session.
-pub(crate) fn subtitle(state: &State, session: &Session) -> String {
+fn subtitle(state: &State, session: &Session) -> String {
     let entry = &state.session;
     let parts = [
         Some(entry.created.strftime("%Y-%m-%d %H:%M UTC").to_string()),

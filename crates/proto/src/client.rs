@@ -13,9 +13,9 @@ use serde::de::DeserializeOwned;
 use serde_json::{Map, Value};
 
 use crate::{
-    CalibrationInfo, CheckParams, CheckReport, Description, DesignParams, DesignReport, Empty, Event, Id,
-    Incoming, Method, Outcome, Request, ResumeParams, RpcError, RunParams, SessionInfo, Started, Status,
-    UseCalibrationParams,
+    CalibrationInfo, CheckParams, CheckReport, Description, DesignParams, DesignReport, DoctorParams,
+    DoctorReport, Empty, Event, Id, Incoming, Method, Outcome, Request, ResumeParams, RpcError, RunParams,
+    SessionInfo, Started, Status, UseCalibrationParams, ViewfinderParams,
 };
 
 /// Maximum time for an answer. No call waits for a run, so a longer wait means that the daemon hangs.
@@ -144,6 +144,14 @@ impl Client {
         self.call(Method::Design, params)
     }
 
+    /// Examines the rig and its host.
+    ///
+    /// # Errors
+    /// As [`Client::describe`].
+    pub fn doctor(&mut self, params: &DoctorParams) -> Result<DoctorReport, ClientError> {
+        self.call(Method::Doctor, params)
+    }
+
     /// Starts a run.
     ///
     /// # Errors
@@ -217,6 +225,14 @@ impl Client {
         self.call(Method::UseCalibration, &params).map(|Empty {}| ())
     }
 
+    /// Changes what the running viewfinder shows.
+    ///
+    /// # Errors
+    /// As [`Client::describe`].
+    pub fn viewfinder(&mut self, params: &ViewfinderParams) -> Result<(), ClientError> {
+        self.call(Method::Viewfinder, params).map(|Empty {}| ())
+    }
+
     /// Streams all events from now on. The connection then carries nothing else; open another one for calls.
     ///
     /// # Errors
@@ -226,7 +242,11 @@ impl Client {
         Ok(Subscription { client: self })
     }
 
-    fn call<R: DeserializeOwned>(
+    /// Calls a method with parameters of any type; the other functions are more convenient.
+    ///
+    /// # Errors
+    /// As [`Client::describe`].
+    pub fn call<R: DeserializeOwned>(
         &mut self,
         method: Method,
         params: &impl Serialize,

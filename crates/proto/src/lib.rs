@@ -5,18 +5,22 @@
 
 mod advice;
 mod client;
+mod doctor;
 pub mod live;
 mod messages;
 mod methods;
 mod rpc;
+mod viewfinder;
 
 pub use advice::{
     BetterPlan, DesignParams, DesignReport, ErrorRange, ExpectedError, NoiseEstimate, NoiseSource, PlanAdvice,
 };
 pub use client::{Client, ClientError, Subscription};
+pub use doctor::{DoctorCheck, DoctorParams, DoctorReport, Grade};
 pub use messages::*;
 pub use methods::{Description, Empty, ErrorInfo, LimitsInfo, Method, MethodInfo, Role, describe};
 pub use rpc::{EventNotice, Id, Incoming, Outcome, Request, Response, params};
+pub use viewfinder::{FocusScore, FocusTrend, RowAlignment, SeenDot, ViewfinderParams, ViewfinderValues};
 
 /// Maximum length of a request, without its line feed.
 pub const MAX_MESSAGE_BYTES: usize = 1 << 20;

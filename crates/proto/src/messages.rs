@@ -7,7 +7,7 @@ use raysweep_core::{ClockQuality, Counts, FilmSummary, SettingsLatency, VsyncSta
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::PlanAdvice;
+use crate::{PlanAdvice, Role, ViewfinderValues};
 
 /// What the daemon is doing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -179,6 +179,9 @@ pub struct Status {
     pub version: String,
     /// Kind of the rig.
     pub rig: String,
+    /// What the caller may do.
+    #[serde(default)]
+    pub role: Option<Role>,
     /// What the daemon is doing.
     pub state: RunState,
     /// What the operator has to do before `continue`, if the run waits for that.
@@ -196,6 +199,9 @@ pub struct Status {
     /// Summary of the film, if the run is a film.
     #[serde(default)]
     pub film: Option<FilmSummary>,
+    /// The newest picture of the viewfinder, while one runs.
+    #[serde(default)]
+    pub viewfinder: Option<Box<ViewfinderValues>>,
     /// How many frames after a change the camera's settings take effect (0: the next frame), as measured by
     /// the run's probe.
     #[serde(default)]
@@ -392,6 +398,8 @@ pub enum Event {
     Film(FilmEstimate),
     /// A batch of a flying dot was stored.
     Batch(BatchStored),
+    /// The viewfinder has a new picture.
+    Viewfinder(Box<ViewfinderValues>),
     /// The run waits for an operator to do this. Obsolete when the run is over.
     Ask {
         /// What the operator has to do.

@@ -6,9 +6,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::live::{self, LiveLayout};
 use crate::{
-    CLIENTS_OF_OPERATORS, CalibrationInfo, CheckParams, CheckReport, DesignParams, DesignReport, ErrorCode,
-    Event, MAX_CLIENTS, MAX_CLIENTS_PER_USER, MAX_MESSAGE_BYTES, ResumeParams, RunParams, SessionInfo,
-    Started, Status, UseCalibrationParams,
+    CLIENTS_OF_OPERATORS, CalibrationInfo, CheckParams, CheckReport, DesignParams, DesignReport,
+    DoctorParams, DoctorReport, ErrorCode, Event, MAX_CLIENTS, MAX_CLIENTS_PER_USER, MAX_MESSAGE_BYTES,
+    ResumeParams, RunParams, SessionInfo, Started, Status, UseCalibrationParams, ViewfinderParams,
 };
 
 /// Role of a caller.
@@ -37,6 +37,8 @@ pub enum Method {
     Check,
     /// Returns a better plan.
     Design,
+    /// Examines the rig and its host.
+    Doctor,
     /// Starts a run.
     Run,
     /// Acquires what a session lacks.
@@ -55,6 +57,8 @@ pub enum Method {
     Calibrations,
     /// Chooses the calibration for later runs.
     UseCalibration,
+    /// Changes what the running viewfinder shows.
+    Viewfinder,
     /// Streams all events from now on.
     Subscribe,
 }
@@ -82,11 +86,12 @@ fn sent<T: JsonSchema>() -> Schema {
 
 impl Method {
     /// Every method.
-    pub const ALL: [Method; 14] = [
+    pub const ALL: [Method; 16] = [
         Self::Describe,
         Self::Status,
         Self::Check,
         Self::Design,
+        Self::Doctor,
         Self::Run,
         Self::Resume,
         Self::Pause,
@@ -96,6 +101,7 @@ impl Method {
         Self::Sessions,
         Self::Calibrations,
         Self::UseCalibration,
+        Self::Viewfinder,
         Self::Subscribe,
     ];
 
@@ -117,6 +123,11 @@ impl Method {
                 "design",
                 Observer,
                 "Searches the settings of a sweep or film for a wanted error, or for a time of light.",
+            ),
+            Self::Doctor => row::<DoctorParams, DoctorReport>(
+                "doctor",
+                Operator,
+                "Examines the rig and its host between runs: opens each device, watches the VSYNC line, takes frames in darkness; moves no mirror.",
             ),
             Self::Run => row::<RunParams, Started>(
                 "run",
@@ -152,6 +163,11 @@ impl Method {
                 "use_calibration",
                 Operator,
                 "Makes a session's calibration the one that later runs use.",
+            ),
+            Self::Viewfinder => row::<ViewfinderParams, Empty>(
+                "viewfinder",
+                Operator,
+                "Changes what the running viewfinder shows; `run` starts one with a plan of kind \"viewfinder\".",
             ),
             Self::Subscribe => row::<Empty, Empty>(
                 "subscribe",
@@ -288,7 +304,17 @@ mod tests {
             Method::ALL.into_iter().filter(|method| method.role() == Role::Operator).map(Method::name);
         assert_eq!(
             drives.collect::<Vec<_>>(),
-            ["run", "resume", "pause", "continue", "cancel", "arm_light", "use_calibration"]
+            [
+                "doctor",
+                "run",
+                "resume",
+                "pause",
+                "continue",
+                "cancel",
+                "arm_light",
+                "use_calibration",
+                "viewfinder"
+            ]
         );
     }
 

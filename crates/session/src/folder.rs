@@ -88,7 +88,9 @@ impl Session {
             Contents::Sweep { .. }
             | Contents::Axes { .. }
             | Contents::Darks { .. }
-            | Contents::Board { .. } => {}
+            | Contents::Board { .. }
+            | Contents::Patterns { .. }
+            | Contents::Nothing => {}
         }
         Ok(())
     }
@@ -151,6 +153,16 @@ impl Session {
         let bound = manifest::paths_of(self)?.into_iter().filter(|(file, _)| is_bound(file));
         let sum = |(file, path): (String, PathBuf)| Ok((file, FileRecord::read(&path)?.sha256));
         Ok(Entry::Files { sha256: bound.map(sum).collect::<Result<_>>()? })
+    }
+
+    /// The size of all its files together.
+    ///
+    /// # Errors
+    /// [`Error::Io`] if a file cannot be examined.
+    pub fn stored_bytes(&self) -> Result<u64> {
+        let paths = manifest::paths_of(self)?;
+        let bytes = |path: &PathBuf| Ok(fs::metadata(path).map_err(Error::io("examine", path))?.len());
+        paths.values().map(bytes).sum()
     }
 
     /// The state according to the ledger, read without locking it.

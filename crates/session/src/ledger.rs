@@ -10,13 +10,13 @@ mod entry;
 mod state;
 
 use std::collections::BTreeMap;
-use std::fs::{File, OpenOptions, TryLockError};
+use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
-use nix::fcntl::OFlag;
-
+use nix::errno::Errno;
+use nix::fcntl::{Flock, FlockArg, OFlag};
 use serde::Deserialize;
 
 use self::chain::{Chain, Fit};
@@ -38,7 +38,9 @@ const NEVER_ELSEWHERE: OFlag = OFlag::O_NOFOLLOW.union(OFlag::O_NONBLOCK);
 #[derive(Debug)]
 pub struct Ledger {
     path: PathBuf,
-    file: File,
+    /// Released on drop, not when the last copy of its descriptor is closed: a process that another thread is starting
+    /// has one for a moment.
+    file: Flock<File>,
     len: u64,
     /// Whether an earlier line is damaged.
     broken: bool,
@@ -113,7 +115,7 @@ impl Ledger {
             .append(true)
             .open(draft.path())
             .map_err(Error::io("create ledger", draft.path()))?;
-        lock(&file, path)?;
+        let file = lock(file, path)?;
         let first = Entry::Session(session);
         let state = State::replay(std::iter::once(&first)).map_err(refused(path))?;
         let mut ledger = Ledger {
@@ -150,7 +152,7 @@ impl Ledger {
         let to_append =
             OpenOptions::new().read(true).append(true).custom_flags(NEVER_ELSEWHERE.bits()).open(path);
         let file = to_append.map_err(Error::io("open ledger", path))?;
-        lock(&file, path)?;
+        let file = lock(file, path)?;
         let bytes = read_bytes(&file, path)?;
         let (text, chain) = parse(&bytes, path)?;
         let state = text.replay(path)?;
@@ -305,10 +307,10 @@ fn check_format(line: &[u8], path: &Path) -> Result<()> {
     }
 }
 
-fn lock(file: &File, path: &Path) -> Result<()> {
-    file.try_lock().map_err(|error| match error {
-        TryLockError::WouldBlock => Error::InUse { path: path.to_owned() },
-        TryLockError::Error(source) => Error::io("lock", path)(source),
+fn lock(file: File, path: &Path) -> Result<Flock<File>> {
+    Flock::lock(file, FlockArg::LockExclusiveNonblock).map_err(|(_, errno)| match errno {
+        Errno::EWOULDBLOCK => Error::InUse { path: path.to_owned() },
+        errno => Error::io("lock", path)(errno.into()),
     })
 }
 

@@ -11,8 +11,8 @@
 use std::io::{self, BufWriter};
 use std::path::{Path, PathBuf};
 
-use ndarray::{Array2, ArrayRef, ArrayView2, ArrayView3, Axis, Dimension};
-use ndarray_npy::{WritableElement, WriteNpyExt};
+use ndarray::{Array2, ArrayD, ArrayRef, ArrayView2, ArrayView3, ArrayViewD, Axis, Dimension};
+use ndarray_npy::{ViewNpyExt, WritableElement, WriteNpyExt};
 use serde_json::{Map, Value};
 
 pub use self::video::{VideoWriter, video_tone_map};
@@ -194,6 +194,23 @@ impl Products {
         let path = self.path(name, "npy")?;
         let bytes = std::fs::read(&path).map_err(Error::io("read", &path))?;
         ndarray_npy::ReadNpyExt::read_npy(bytes.as_slice()).map_err(Error::codec("read", path.display()))
+    }
+
+    /// Reads back the array of a product, with any number of axes.
+    ///
+    /// # Errors
+    /// [`Error::Io`] if it is missing, [`Error::Codec`] if it is damaged.
+    pub fn read_array(&self, name: &str) -> Result<ArrayD<f32>> {
+        let path = self.path(name, "npy")?;
+        let failed = || Error::io("read", &path);
+        let mut file = std::fs::File::open(&path).map_err(failed())?;
+        let length = usize::try_from(file.metadata().map_err(failed())?.len()).unwrap_or(usize::MAX);
+        // Aligned for the view, which compares the header with the length before anything is allocated for it.
+        let mut aligned = vec![0_f32; length.div_ceil(size_of::<f32>())];
+        let bytes: &mut [u8] = &mut bytemuck::cast_slice_mut(&mut aligned)[..length];
+        io::Read::read_exact(&mut file, bytes).map_err(failed())?;
+        let view = ArrayViewD::<f32>::view_npy(bytes).map_err(Error::codec("read", path.display()))?;
+        Ok(view.to_owned())
     }
 
     /// Writes a product's mask; returns it as a channel.

@@ -7,6 +7,8 @@
 //! | `regular` | uint32 | `[1, t, s]` | all rows lit by a long exposure |
 //! | `clipped` | uint32 | `[point, t, s]` | in how many of the frames of a point of `sum` the pixel saturated |
 //!
+//! Where pictures vary, a point of `sum` is an image under one of them, point = pattern * settings + setting.
+//!
 //! A point of `clipped` is written only if some pixel saturated; then its ledger line has `clipped_crc32`. Sessions from
 //! before these frames were counted do not have the array.
 //!
@@ -122,6 +124,17 @@ pub enum Contents {
         /// Number of images of the capped lens.
         capped: usize,
     },
+    /// Images under pictures of the projector, in `stack.zarr` with their dark images and the regular image under white.
+    Patterns {
+        /// Number of pictures.
+        patterns: usize,
+        /// Number of images under each picture.
+        settings: usize,
+        /// Number of exposures, each with a dark image.
+        exposures: usize,
+    },
+    /// Nothing: the session only says that there was light, and when.
+    Nothing,
 }
 
 /// A shape as ledgers have it. Those written before there was `contents` tell it by what is 0.
@@ -148,6 +161,8 @@ enum Kind {
     Axes,
     Darks,
     Board,
+    Patterns,
+    Nothing,
 }
 
 /// Most camera rows or columns.
@@ -168,6 +183,10 @@ impl From<StackShape> for StoredShape {
             Contents::Axes { axes } => (Kind::Axes, axes, 0, 0, 0),
             Contents::Darks { images } => (Kind::Darks, images, images, 0, 0),
             Contents::Board { images, capped } => (Kind::Board, images, capped, 0, 0),
+            Contents::Patterns { patterns, settings, exposures } => {
+                (Kind::Patterns, patterns, exposures, settings, 0)
+            }
+            Contents::Nothing => (Kind::Nothing, 0, 0, 0, 0),
         };
         Self { contents: Some(kind), points, exposures, rows, columns, settings, dots }
     }
@@ -191,6 +210,8 @@ impl TryFrom<StoredShape> for StackShape {
             Kind::Axes => Contents::Axes { axes: points },
             Kind::Darks => Contents::Darks { images: points },
             Kind::Board => Contents::Board { images: points, capped: exposures },
+            Kind::Patterns => Contents::Patterns { patterns: points, settings, exposures },
+            Kind::Nothing => Contents::Nothing,
         };
         let shape = Self { contents, rows, columns };
         shape.check().map(|()| shape).map_err(|error| error.to_string())
@@ -198,7 +219,7 @@ impl TryFrom<StoredShape> for StackShape {
 }
 
 impl StackShape {
-    /// Planned points: images of a sweep, cycles of a film, batches of a flying dot, axes of a mirror, or dark images.
+    /// Planned points: images of a sweep or under pictures, cycles of a film, batches of a flying dot, axes of a mirror, or dark images.
     pub fn points(&self) -> usize {
         match self.contents {
             Contents::Sweep { points, .. } => points,
@@ -206,6 +227,8 @@ impl StackShape {
             Contents::Batches { batches, .. } => batches,
             Contents::Axes { axes } => axes,
             Contents::Darks { images } | Contents::Board { images, .. } => images,
+            Contents::Patterns { patterns, settings, .. } => patterns.saturating_mul(settings),
+            Contents::Nothing => 0,
         }
     }
 
@@ -216,10 +239,14 @@ impl StackShape {
                 points
             }
             (ArrayName::Clipped, Contents::Sweep { points, .. }) => points,
-            (ArrayName::Regular, Contents::Sweep { .. }) => 1,
-            (ArrayName::Dark, Contents::Sweep { exposures, .. } | Contents::Film { exposures, .. }) => {
-                exposures
-            }
+            (ArrayName::Sum | ArrayName::Clipped, Contents::Patterns { .. }) => self.points(),
+            (ArrayName::Regular, Contents::Sweep { .. } | Contents::Patterns { .. }) => 1,
+            (
+                ArrayName::Dark,
+                Contents::Sweep { exposures, .. }
+                | Contents::Film { exposures, .. }
+                | Contents::Patterns { exposures, .. },
+            ) => exposures,
             (ArrayName::Dark, Contents::Darks { images } | Contents::Board { capped: images, .. }) => images,
             _ => 0,
         }
@@ -228,10 +255,10 @@ impl StackShape {
     /// The arrays that exist for this kind of session; none: there is no stack.
     pub(crate) fn arrays(&self) -> &'static [ArrayName] {
         match self.contents {
-            Contents::Sweep { .. } => &ArrayName::ALL,
+            Contents::Sweep { .. } | Contents::Patterns { .. } => &ArrayName::ALL,
             Contents::Film { .. } | Contents::Darks { .. } => &[ArrayName::Dark],
             Contents::Board { .. } => &[ArrayName::Dark, ArrayName::Sum],
-            Contents::Batches { .. } | Contents::Axes { .. } => &[],
+            Contents::Batches { .. } | Contents::Axes { .. } | Contents::Nothing => &[],
         }
     }
 
@@ -265,6 +292,11 @@ impl StackShape {
             Contents::Axes { axes } => ("axes", vec![axes]),
             Contents::Darks { images } => ("images", vec![images]),
             Contents::Board { images, capped } => ("images, capped", vec![images, capped]),
+            Contents::Patterns { patterns, settings, exposures } => (
+                "patterns, settings, exposures, images",
+                vec![patterns, settings, exposures, patterns.saturating_mul(settings)],
+            ),
+            Contents::Nothing => ("nothing", Vec::new()),
         };
         let found: Vec<usize> = counts.into_iter().chain([self.rows, self.columns]).collect();
         let is_side = |pixels| pixels <= MAX_SIDE_PX;

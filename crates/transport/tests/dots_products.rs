@@ -5,9 +5,7 @@
 use ndarray::{Array2, Array3, Axis, Zip, s};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use rand_xoshiro::rand_core::{Rng, SeedableRng};
-use raysweep_transport::dots::calibrate::{
-    Centroids, Confusion, Correspondence, Footprints, Fundamental, PointSpreads,
-};
+use raysweep_transport::dots::calibrate::{Centroids, Confusion, Footprints, Fundamental, PointSpreads};
 use raysweep_transport::dots::product::{
     EpipolarMask, MaskRule, Separation, column_energies, compensate, coverage, dual, epipolar, fill_holes,
     floodlit, pattern_weights, relight, relight_sequence, shadow_dot, shadow_neighbours,
@@ -45,6 +43,10 @@ fn batch(shape: FrameShape, images: &[Array3<f32>], least: f32) -> Batch {
     let mut arrays = BatchArrays::default();
     images.iter().for_each(|image| arrays.push(&column(shape, image, least)));
     Batch::new(shape, arrays).unwrap()
+}
+
+fn centroids_of(batch: &Batch) -> Centroids {
+    Centroids::new(batch, &Footprints::new(batch, 0.5).unwrap()).unwrap()
 }
 
 /// The images that a batch represents: values in masks, means elsewhere.
@@ -357,7 +359,7 @@ fn a_mask_of_the_dots_own_width_keeps_the_planes_light_and_the_printed_one_a_fif
     };
     assert!(share(MaskRule::Plateau) >= 0.98, "{}", share(MaskRule::Plateau));
     assert!((share(MaskRule::Printed) - 0.2).abs() < 0.05, "{}", share(MaskRule::Printed));
-    let radius_px = PointSpreads::new(&batch).unwrap().radius_px().unwrap();
+    let radius_px = PointSpreads::new(&batch, &centroids_of(&batch)).unwrap().radius_px().unwrap();
     assert!((7.5..=9.5).contains(&radius_px), "{radius_px}");
 }
 
@@ -365,7 +367,7 @@ fn a_mask_of_the_dots_own_width_keeps_the_planes_light_and_the_printed_one_a_fif
 fn overlapping_dots_are_compensated_by_their_spreads() {
     let plane = scan(|_| 0.0, 0.0);
     let batch = batch(plane.shape, &plane.images, 3.0);
-    let spreads = PointSpreads::new(&batch).unwrap();
+    let spreads = PointSpreads::new(&batch, &centroids_of(&batch)).unwrap();
     assert!(spreads.unimodal.iter().all(|&unimodal| unimodal));
     let light = floodlit(&batch);
     let even = compensate(&light, &coverage(&spreads)).unwrap();
@@ -382,7 +384,8 @@ fn a_dot_on_a_boundary_of_textures_is_taken_for_a_pillbox() {
     let mut plane = scan(|_| 0.0, 0.0);
     // A black line through the first dot; the remaining light there is still in the mask.
     plane.images[0].slice_mut(s![12..29, 19..22, ..]).fill(5.0);
-    let spreads = PointSpreads::new(&batch(plane.shape, &plane.images[..2], 3.0)).unwrap();
+    let two = batch(plane.shape, &plane.images[..2], 3.0);
+    let spreads = PointSpreads::new(&two, &centroids_of(&two)).unwrap();
     assert_eq!(spreads.unimodal, [false, true]);
     assert!(spreads.columns.column(0).pixels().all(|(_, value)| value == [1.0]));
 }
@@ -493,21 +496,16 @@ fn two_scanned_planes_calibrate_the_lines_of_a_third() {
         let batch = batch(scan.shape, &scan.images, 3.0);
         Centroids::new(&batch, &Footprints::new(&batch, 0.5).unwrap()).unwrap()
     };
-    let pairs = |shifts: &[f64]| -> Vec<Correspondence> {
-        let planes = shifts.iter().map(|&shift| plane(shift));
-        let mirror = |dot: usize| [(dot % 16) as f64 * 0.01, (dot / 16) as f64 * 0.01];
-        planes
-            .flat_map(|plane| plane.xy.into_iter().enumerate())
-            .filter_map(|(dot, camera)| Some(Correspondence { mirror: mirror(dot), camera: camera? }))
-            .collect()
-    };
-    let fundamental = Fundamental::from_correspondences(&pairs(&[0.0, 12.0])).unwrap();
-    for pair in pairs(&[-6.0, 6.0]) {
-        let [l1, l2, l3] = fundamental.epipolar_line(pair.mirror);
-        let distance = (l1 * pair.camera[0] + l2 * pair.camera[1] + l3).abs() / l1.hypot(l2);
-        assert!(distance < 0.3, "{distance}");
+    let first = plane(0.0).xy;
+    let fit = Fundamental::from_planes(&first, &plane(12.0).xy).unwrap();
+    for third in [-6.0, 6.0].map(plane) {
+        for (place, [x, y]) in first.iter().zip(third.xy).filter_map(|(place, at)| Some(((*place)?, at?))) {
+            let [l1, l2, l3] = fit.fundamental.epipolar_line(place);
+            let distance = (l1 * x + l2 * y + l3).abs() / l1.hypot(l2);
+            assert!(distance < 0.3, "{distance}");
+        }
     }
-    assert!(matches!(Fundamental::from_correspondences(&pairs(&[0.0])), Err(DotsError::Planar { .. })));
+    assert!(matches!(Fundamental::from_planes(&first, &first), Err(DotsError::Planar { .. })));
 }
 
 #[test]

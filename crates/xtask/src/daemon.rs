@@ -27,6 +27,8 @@ impl Daemon {
         let runtime = std::env::temp_dir().join(format!("raysweep-xtask-{}-{number}", std::process::id()));
         std::fs::create_dir_all(&runtime).map_err(|error| format!("{}: {error}", runtime.display()))?;
         let process = Command::new(programs.join("raysweepd"))
+            // As its unit does.
+            .env("MALLOC_ARENA_MAX", "1")
             .arg("--rig")
             .arg(rig)
             .arg("--socket")

@@ -10,7 +10,15 @@ use crate::run::{Done, cargo, root, run, target};
 /// Builds, starts the daemon, runs the plan, stops the daemon.
 pub fn demo() -> Done {
     let began = Instant::now();
-    run(cargo().args(["build", "--package", "raysweep", "--bins", "--profile", "demo"]))?;
+    run(cargo().args([
+        "build",
+        "--package",
+        "raysweep",
+        "--bins",
+        "--profile",
+        "demo",
+        "--no-default-features",
+    ]))?;
     let built_s = began.elapsed().as_secs_f64();
 
     let programs = target().join("demo");

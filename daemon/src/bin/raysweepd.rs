@@ -10,7 +10,9 @@ use nix::sys::stat::{Mode, umask};
 use nix::unistd::{AccessFlags, access};
 use raysweep::Runner;
 use raysweep::arguments::DaemonArguments;
+use raysweep::cli::doctor_text;
 use raysweep::control::Control;
+use raysweep::doctor;
 use raysweep::journal;
 use raysweep::live::{LiveError, LiveFile};
 use raysweep::mirror;
@@ -18,6 +20,7 @@ use raysweep::rig::{AnyRig, RigError};
 use raysweep::server::{self, Access, Listening};
 use raysweep_core::io_text;
 use raysweep_drivers::mirror::{Parked, park};
+use raysweep_proto::Grade;
 use sd_notify::NotifyState;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
@@ -33,8 +36,8 @@ fn main() -> ExitCode {
     if let Ok(data) = std::path::absolute(&arguments.data) {
         arguments.data = data;
     }
-    match run(&arguments) {
-        Ok(()) => ExitCode::SUCCESS,
+    match if arguments.check { check(&arguments) } else { run(&arguments) } {
+        Ok(code) => code,
         Err(error) => {
             for line in error.to_string().lines() {
                 // Excerpts of files are indented.
@@ -49,22 +52,28 @@ fn main() -> ExitCode {
     }
 }
 
-fn run(arguments: &DaemonArguments) -> Result<(), Box<dyn std::error::Error>> {
+/// Examines the rig as `raysweep doctor` does.
+fn check(arguments: &DaemonArguments) -> Result<ExitCode, Box<dyn std::error::Error>> {
     let rig = AnyRig::load(&arguments.rig)?;
-    if !arguments.check {
-        prepare_data(&arguments.data).map_err(|error| {
-            format!(
-                "--data {}: {}; give a folder that raysweepd can write to",
-                arguments.data.display(),
-                io_text(&error)
-            )
-        })?;
-        // Must come before opening a mirror's driver, which refuses a mirror that was left unparked.
-        park_left_behind(&arguments.data);
-    }
+    let report = doctor::examine(&rig.into(), &arguments.data, None, &|| true);
+    println!("{}", doctor_text(&report));
+    Ok(if report.worst() == Grade::Failure { ExitCode::FAILURE } else { ExitCode::SUCCESS })
+}
+
+fn run(arguments: &DaemonArguments) -> Result<ExitCode, Box<dyn std::error::Error>> {
+    let rig = AnyRig::load(&arguments.rig)?;
+    prepare_data(&arguments.data).map_err(|error| {
+        format!(
+            "--data {}: {}; give a folder that raysweepd can write to",
+            arguments.data.display(),
+            io_text(&error)
+        )
+    })?;
+    // Must come before opening a mirror's driver, which refuses a mirror that was left unparked.
+    park_left_behind(&arguments.data);
     // Outlives the runner, and so the mirror's driver.
     let _guardian = match &rig {
-        AnyRig::Dots(rig) if !arguments.check && rig.has_real_mirror() => Some(
+        AnyRig::Dots(rig) if rig.has_real_mirror() => Some(
             mirror::guardian(&arguments.data)
                 .map_err(|error| format!("cannot start `raysweep park`, which guards the mirror: {error}"))?,
         ),
@@ -80,10 +89,6 @@ fn run(arguments: &DaemonArguments) -> Result<(), Box<dyn std::error::Error>> {
         camera.format,
         arguments.rig.display()
     );
-    if arguments.check {
-        println!("{opened}");
-        return Ok(());
-    }
     tracing::info!("{opened}");
     let runner = match arguments.memory {
         Some(size) => runner.with_memory_limit(size.as_u64()),
@@ -98,7 +103,7 @@ fn run(arguments: &DaemonArguments) -> Result<(), Box<dyn std::error::Error>> {
     // If the server failed, a run may still be in progress; after a clean shutdown there is none.
     runner.shut_down();
     runtime.shutdown_timeout(Duration::from_secs(1));
-    served
+    served.map(|()| ExitCode::SUCCESS)
 }
 
 /// The live file at the requested path; by default beside the socket, where failure is tolerated: no run needs it.

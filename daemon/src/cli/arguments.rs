@@ -3,12 +3,15 @@
 use std::path::PathBuf;
 
 use bytesize::ByteSize;
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use clap::{Parser, Subcommand};
+use raysweep_core::FinderPicture;
+use raysweep_processing::ExportFormat;
 
 use super::calibration::CalibrationCommand;
 use super::devices::CameraCommand;
 use super::sessions::SessionFilter;
-use crate::arguments::memory_size;
+use crate::arguments::{DEFAULT_DATA, memory_size};
 
 const EXIT_CODES: &str = "\
 Exit codes:
@@ -29,6 +32,9 @@ pub struct Arguments {
     /// Print JSON, one line for each result, event or error
     #[arg(long, global = true)]
     pub json: bool,
+    /// Follow runs without their progress: print only questions, warnings, errors and the result
+    #[arg(long, short, global = true)]
+    pub quiet: bool,
     #[command(subcommand)]
     pub command: Command,
 }
@@ -41,6 +47,35 @@ pub enum Command {
     Describe,
     /// List the cameras that respond; needs no daemon
     Devices,
+    /// Find the devices that are connected, ask what nothing else can tell, and write a rig file and a first plan. Moves no
+    /// mirror, turns no light on, and asks a serial port only if you agree
+    Setup {
+        /// Answers for all questions, a TOML file, instead of a terminal
+        #[arg(long, value_name = "FILE")]
+        answers: Option<PathBuf>,
+        /// The rig file to write
+        #[arg(long, value_name = "FILE", default_value = "rig.toml")]
+        rig: PathBuf,
+        /// The plan to write
+        #[arg(long, value_name = "FILE", default_value = "first-plan.toml")]
+        plan: PathBuf,
+        /// Replace files that are there
+        #[arg(long)]
+        force: bool,
+    },
+    /// Examine the rig and its host, as the daemon's user: devices, permissions, VSYNC, triggers, disk; say what mends
+    /// what is wrong. Moves no mirror and turns no light on
+    Doctor {
+        /// A plan, whose needs the disk is examined for
+        #[arg(conflicts_with = "rig")]
+        plan: Option<PathBuf>,
+        /// Examine the rig of this rig file, without a daemon and as the user who asks
+        #[arg(long, value_name = "FILE")]
+        rig: Option<PathBuf>,
+        /// With --rig: the folder in which the daemon would store sessions
+        #[arg(long, value_name = "DIR", requires = "rig", default_value = DEFAULT_DATA)]
+        data: PathBuf,
+    },
     /// Save and restore a camera's settings; needs no daemon
     #[command(subcommand)]
     Camera(CameraCommand),
@@ -63,8 +98,17 @@ pub enum Command {
         #[arg(long, value_name = "US")]
         edge_us: Option<f64>,
     },
+    /// Look at the scene under white light, and print a plan whose exposures do not saturate it, with the averaging that
+    /// its noise needs and what aperture or gain should do
+    Expose {
+        /// A plan of kind "sweep" or "film", a TOML file: no exposure is made longer than its longest
+        plan: PathBuf,
+    },
     /// Run a plan and follow the run; Ctrl-C cancels it, a second Ctrl-C exits without waiting for its end
     Run(RunArguments),
+    /// Show live pictures for focusing, aligning and exposing until Ctrl-C, and say what they tell; while a viewfinder
+    /// runs, change what it shows
+    Viewfinder(ViewfinderArguments),
     /// Calibrate the rig from a white board, and follow the run as `run` does
     Calibrate {
         /// A plan of kind "calibration" [default: one with nothing but its kind]
@@ -100,6 +144,13 @@ pub enum Command {
         /// Write the picture again for each new estimate, until the end of the run
         #[arg(long)]
         follow: bool,
+    },
+    /// Show the rig in a browser: live pictures, progress, sessions; serves one page on this machine until Ctrl-C
+    #[cfg(feature = "view")]
+    View {
+        /// Port on 127.0.0.1 [default: any free one]
+        #[arg(long, value_name = "PORT", default_value_t = 0, hide_default_value = true)]
+        port: u16,
     },
     /// Pause the run before its next point
     Pause,
@@ -212,9 +263,12 @@ pub enum Command {
     Export {
         /// The session's folder, or its name within the daemon's data folder
         session: PathBuf,
-        /// The folder to create [default: the session's name with `-export`, in the current folder]
-        #[arg(long, value_name = "DIR")]
+        /// The folder or archive to create [default: the session's name with `-export`, in the current folder]
+        #[arg(long, value_name = "PATH")]
         to: Option<PathBuf>,
+        /// Products alone in the format of another program, with a README of their axes and units; `zip` archives the copy
+        #[arg(long, value_parser = format_parser())]
+        format: Option<ExportFormat>,
         /// Also copy its arrays: the images that the camera took, and the light transport
         #[arg(long)]
         stack: bool,
@@ -249,6 +303,55 @@ pub struct RunDescription {
     /// A tag to find the session by; may be repeated
     #[arg(long = "tag", value_name = "TAG")]
     pub tags: Vec<String>,
+}
+
+#[derive(Debug, clap::Args)]
+pub struct ViewfinderArguments {
+    /// What the projector shows; on a dot rig all but `black` are the dot [default: white]
+    #[arg(long, value_parser = picture_parser())]
+    pub picture: Option<FinderPicture>,
+    /// Region of the focus score and the other figures: first row, row after the last, first column, column after the last
+    #[arg(long, value_name = "T0,T1,S0,S1", value_parser = region)]
+    pub region: Option<[usize; 4]>,
+    /// Exposure of each frame in microseconds [default: 0.9 of the time from frame to frame]
+    #[arg(long, value_name = "US")]
+    pub exposure_us: Option<f64>,
+    /// Have the white board put before the camera first, as for aligning
+    #[arg(long)]
+    pub board: bool,
+    /// End after this many seconds [default: with Ctrl-C or `raysweep cancel`]
+    #[arg(long, value_name = "S")]
+    pub seconds: Option<f64>,
+    /// Start it with this plan of kind "viewfinder" instead
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["picture", "region", "exposure_us", "board", "seconds"])]
+    pub plan: Option<PathBuf>,
+    #[command(flatten)]
+    pub about: RunDescription,
+}
+
+fn format_parser() -> impl TypedValueParser<Value = ExportFormat> {
+    let values = ExportFormat::ALL.map(|format| {
+        let (name, about) = format.described();
+        PossibleValue::new(name).help(about)
+    });
+    PossibleValuesParser::new(values).map(|name| {
+        let named = ExportFormat::ALL.into_iter().find(|format| format.described().0 == name);
+        // The parser allows these names alone.
+        named.unwrap_or(ExportFormat::Npy)
+    })
+}
+
+fn picture_parser() -> impl TypedValueParser<Value = FinderPicture> {
+    PossibleValuesParser::new(FinderPicture::ALL.map(FinderPicture::name)).map(|name| {
+        let named = FinderPicture::ALL.into_iter().find(|picture| picture.name() == name);
+        named.unwrap_or_default()
+    })
+}
+
+fn region(text: &str) -> Result<[usize; 4], String> {
+    let numbers: Result<Vec<usize>, _> = text.split(',').map(|number| number.trim().parse()).collect();
+    let region = numbers.ok().and_then(|numbers| <[usize; 4]>::try_from(numbers).ok());
+    region.ok_or_else(|| "give four whole numbers separated by commas, such as 0,128,0,128".into())
 }
 
 /// A time with its unit, `s` or `ms`, in seconds.

@@ -14,6 +14,7 @@ use serde_json::{Value, json};
 use super::exit::Exit;
 use crate::journal;
 use crate::live::LiveError;
+use crate::rig::RigError;
 use raysweep_processing::ProcessError;
 
 /// Why the command failed.
@@ -39,6 +40,12 @@ pub(super) enum CommandFailure {
     Calibration(String),
     #[error("{0}")]
     Sessions(String),
+    #[error("{0}")]
+    Setup(String),
+    #[error("{0}")]
+    Exposure(String),
+    #[error(transparent)]
+    Rig(#[from] RigError),
     #[error(transparent)]
     Process(#[from] ProcessError),
     #[cfg(feature = "aravis")]
@@ -56,6 +63,9 @@ pub(super) enum CommandFailure {
     Park(#[from] ParkError),
     #[error("cannot handle Ctrl-C: {0}")]
     Signals(io::Error),
+    #[cfg(feature = "view")]
+    #[error("cannot serve the page: {}", io_text(.0))]
+    View(io::Error),
     #[error("cannot print: {0}")]
     Output(io::Error),
 }
@@ -137,6 +147,8 @@ impl CommandFailure {
             | Self::NotPng(_)
             | Self::Calibration(_)
             | Self::Sessions(_)
+            | Self::Setup(_)
+            | Self::Rig(RigError::Read { .. } | RigError::Config(_))
             | Self::Process(ProcessError::Product(_)) => Exit::Usage,
             #[cfg(feature = "aravis")]
             Self::WhichCamera(_) => Exit::Usage,
@@ -147,8 +159,12 @@ impl CommandFailure {
             #[cfg(not(feature = "aravis"))]
             Self::WithoutAravis => Exit::Usage,
             Self::NoLiveImage => Exit::Refused,
+            #[cfg(feature = "view")]
+            Self::View(_) => Exit::Failed,
             Self::Write { .. }
             | Self::Live(_)
+            | Self::Rig(_)
+            | Self::Exposure(_)
             | Self::Process(_)
             | Self::Park(_)
             | Self::Signals(_)

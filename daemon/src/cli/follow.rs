@@ -44,7 +44,7 @@ impl Interrupts {
     }
 
     /// Whether Ctrl-C was pressed since the last call.
-    fn pending(&mut self) -> bool {
+    pub fn pending(&mut self) -> bool {
         let Self { runtime, signal } = self;
         runtime.block_on(async {
             // Yielding lets the runtime poll for signals.

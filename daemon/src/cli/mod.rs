@@ -1,18 +1,26 @@
 //! The command line `raysweep`: what it takes, whom it asks, how it ends.
 
 mod arguments;
+#[cfg(feature = "view")]
+mod browser;
 mod calibration;
 mod devices;
+mod doctor;
 mod exit;
+mod expose;
 mod failure;
+mod finder_text;
 mod follow;
 mod manuals;
+mod plan_file;
 mod preview;
 mod printer;
 mod resume;
 mod sessions;
+mod setup;
 mod show;
 mod view;
+mod viewfinder;
 
 use std::ffi::OsString;
 use std::fs;
@@ -28,13 +36,19 @@ use raysweep_proto::{
 use serde_json::json;
 
 use self::arguments::{Arguments, Command, RunArguments, RunDescription};
+pub use self::doctor::text as doctor_text;
 use self::exit::Exit;
 use self::failure::CommandFailure;
 use self::follow::{Interrupts, OnInterrupt, follow};
+use self::plan_file::read_plan;
 use self::printer::Printer;
 use self::sessions::{Compared, SessionView};
+use self::setup::{SetupFiles, setup};
 use self::view::EventView;
-use raysweep_processing::{Asked, ExportScope, ProcessError, copy_acquired, export, process_asked};
+use self::viewfinder::{Wanted, change_or_plan, changed};
+use raysweep_processing::{
+    Asked, ExportFormat, ExportScope, ProcessError, copy_acquired, export, export_as, process_asked,
+};
 use raysweep_session::Session;
 use raysweep_session::integrity::Audit;
 use raysweep_session::ledger::Remark;
@@ -53,14 +67,22 @@ pub fn main() -> ExitCode {
 }
 
 fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
-    let Arguments { socket, json, command } = arguments;
+    let Arguments { socket, json, quiet, command } = arguments;
     let socket = socket_path(socket, std::env::var_os("RAYSWEEP_SOCKET"));
     let connect = || Client::connect(&socket);
-    let printer = Printer { json };
+    let printer = Printer { json, quiet };
     match command {
         Command::Status => printer.print(&connect()?.status()?, show::status)?,
         Command::Describe => printer.print(&connect()?.describe()?, show::description)?,
         Command::Devices => return devices::devices(printer),
+        Command::Setup { answers, rig, plan, force } => {
+            let files = SetupFiles { answers: answers.as_deref(), rig: &rig, plan: &plan, force };
+            return setup(&files, printer);
+        }
+        Command::Doctor { plan, rig: None, .. } => {
+            return doctor::by_daemon(&socket, plan.as_deref(), printer);
+        }
+        Command::Doctor { rig: Some(rig), data, .. } => return doctor::by_hand(&rig, &data, printer),
         Command::Camera(command) => return devices::camera(command, printer),
         Command::Check { plan } => {
             let text = read_plan(&plan)?;
@@ -84,6 +106,11 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
         Command::Calibrate { plan: None, about } => {
             return run(&socket, printer, Path::new("calibrate"), calibration::PLAN, about);
         }
+        Command::Expose { plan } => return expose::expose(&socket, &plan, printer),
+        Command::Viewfinder(arguments) => match change_or_plan(&socket, &arguments)? {
+            Wanted::Plan(path, text) => return run(&socket, printer, &path, &text, arguments.about),
+            Wanted::Changed => return changed(printer),
+        },
         Command::Calibration(command) => return calibration::calibration(&socket, command, printer),
         Command::Resume { session, detach, .. } => {
             let session = match session {
@@ -104,6 +131,8 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
         Command::Preview { output, follow } => {
             return preview::preview(&socket, &output, follow, printer);
         }
+        #[cfg(feature = "view")]
+        Command::View { port } => return browser::view(&socket, port, printer),
         Command::Pause => {
             connect()?.pause()?;
             printer.print(&Empty {}, |_| {
@@ -205,11 +234,17 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
         Command::Manuals { folder } => {
             manuals::write(&folder).map_err(|source| CommandFailure::Write { path: folder, source })?;
         }
-        Command::Export { session, to, stack, accept_damage } => {
+        Command::Export { session, to, format, stack, accept_damage } => {
+            if stack && !matches!(format, None | Some(ExportFormat::Zip)) {
+                return Err(CommandFailure::Sessions(STACK_WITH_FORMAT.into()));
+            }
             let session = folder_of(session, &socket);
-            let to = to.unwrap_or_else(|| export_folder(&session));
+            let to = to.unwrap_or_else(|| export_path(&session, format));
             let scope = if stack { ExportScope::ResultsAndArrays } else { ExportScope::Results };
-            let files = export(&session, &to, accept_damage, scope)?;
+            let files = match format {
+                Some(format) => export_as(&session, &to, accept_damage, scope, format)?,
+                None => export(&session, &to, accept_damage, scope)?,
+            };
             let value = json!({ "folder": to, "files": files });
             printer.print(&value, |_| format!("{files} files copied to {}", to.display()))?;
         }
@@ -277,7 +312,7 @@ fn begin_run(
     let events = Client::connect(socket)?.subscribe()?;
     let interrupts = Interrupts::new().map_err(CommandFailure::Signals)?;
     let Started { session } = begin(&mut client)?;
-    follow(events, &session, interrupts, EventView::new(printer.json), OnInterrupt::Cancel(client))
+    follow(events, &session, interrupts, EventView::new(printer), OnInterrupt::Cancel(client))
 }
 
 fn watch(socket: &Path, printer: Printer) -> Result<Exit, CommandFailure> {
@@ -289,11 +324,15 @@ fn watch(socket: &Path, printer: Printer) -> Result<Exit, CommandFailure> {
         let message = "no run in progress; `raysweep sessions` lists earlier runs";
         return Err(ClientError::Rpc(RpcError::new(ErrorCode::NotRunning, message)).into());
     };
-    let mut view = EventView::new(printer.json);
+    let mut view = EventView::new(printer);
     // What was said before anybody watched.
     let state = Event::State { state: status.state, session: Some(session.clone()) };
-    let said =
-        [Some(state), status.progress.map(Event::Progress), status.question.map(|text| Event::Ask { text })];
+    let said = [
+        Some(state),
+        status.progress.map(Event::Progress),
+        status.viewfinder.map(Event::Viewfinder),
+        status.question.map(|text| Event::Ask { text }),
+    ];
     for event in said.into_iter().flatten() {
         view.show(&event).map_err(CommandFailure::Output)?;
     }
@@ -303,10 +342,6 @@ fn watch(socket: &Path, printer: Printer) -> Result<Exit, CommandFailure> {
 fn socket_path(argument: Option<PathBuf>, variable: Option<OsString>) -> PathBuf {
     let variable = variable.filter(|value| !value.is_empty()).map(PathBuf::from);
     argument.or(variable).unwrap_or_else(|| DEFAULT_SOCKET.into())
-}
-
-fn read_plan(path: &Path) -> Result<String, CommandFailure> {
-    fs::read_to_string(path).map_err(|source| CommandFailure::File { path: path.to_owned(), source })
 }
 
 /// The folder of a session, which is given by its folder, or by its name in the data folder of the daemon, if that answers.
@@ -319,10 +354,17 @@ fn folder_of(given: PathBuf, socket: &Path) -> PathBuf {
     named.map_or(given, |info| info.session)
 }
 
-fn export_folder(session: &Path) -> PathBuf {
+const STACK_WITH_FORMAT: &str =
+    "--stack copies Zarr arrays as they are: leave --format out, or take --format zip";
+
+/// Where a session is exported to by default.
+fn export_path(session: &Path, format: Option<ExportFormat>) -> PathBuf {
     let session = fs::canonicalize(session).unwrap_or_else(|_| session.to_owned());
     let mut name = session.file_name().unwrap_or_default().to_owned();
     name.push("-export");
+    if format == Some(ExportFormat::Zip) {
+        name.push(".zip");
+    }
     name.into()
 }
 

@@ -10,6 +10,8 @@ use super::failure::CommandFailure;
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Printer {
     pub json: bool,
+    /// Whether a run is followed without its progress.
+    pub quiet: bool,
 }
 
 impl Printer {

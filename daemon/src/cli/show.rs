@@ -38,6 +38,11 @@ pub(super) fn status(status: &Status) -> String {
     if let Some(film) = &status.film {
         rows.push(("film", self::film(film)));
     }
+    if let Some(values) = &status.viewfinder {
+        rows.push(("shows", super::finder_text::line(values)));
+        rows.extend(values.alignment.iter().map(|found| ("", super::finder_text::alignment(found))));
+        rows.extend(values.problem.iter().map(|problem| ("problem", problem.clone())));
+    }
     if let Some(vsync) = &status.vsync {
         rows.push((
             "vsync",
@@ -243,7 +248,7 @@ pub(super) fn design(report: &DesignReport) -> String {
     format!("{comments}{}", plan.trim_end())
 }
 
-fn errors(expected: &ExpectedError) -> String {
+pub(super) fn errors(expected: &ExpectedError) -> String {
     let ExpectedError { total, noise, bias, calibration, .. } = expected;
     format!(
         "{}; noise {}, bias {}, calibration {}",

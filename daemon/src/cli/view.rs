@@ -4,8 +4,10 @@ use std::io::{self, IsTerminal, Write};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
-use raysweep_proto::{Event, FilmEstimate, Progress, RunState};
+use raysweep_proto::{Event, FilmEstimate, Progress, RunState, ViewfinderValues};
 
+use super::finder_text;
+use super::printer::Printer;
 use super::show::{self, Ending};
 
 /// Interval between progress lines where no bar can be drawn.
@@ -14,11 +16,18 @@ const PACE: Duration = Duration::from_secs(5);
 /// Fits into 80 columns: the message is cut where the terminal ends, so the line never wraps.
 const BAR: &str = "{prefix:>9} [{bar:20}] {pos}/{len}  {wide_msg}";
 
+/// A viewfinder has no end to count to.
+const FINDER: &str = "{wide_msg}";
+/// Interval between a viewfinder's lines where they cannot be overwritten.
+const FINDER_PACE: Duration = Duration::from_secs(1);
+
 /// Displays a run's events.
 pub(super) struct EventView {
     place: Place,
     /// Points in the newest live estimate.
     live: Option<usize>,
+    /// What a viewfinder has said of the rows, how often, and of its problem.
+    said: (u64, Option<String>),
 }
 
 /// Where the events are displayed.
@@ -30,14 +39,16 @@ enum Place {
         /// When progress was last printed.
         told: Option<Instant>,
     },
+    /// Nowhere, except for questions, warnings and errors.
+    Quiet,
     /// Each event as a line on standard output.
     Json,
 }
 
 impl EventView {
     /// The view that suits our output.
-    pub fn new(json: bool) -> Self {
-        Self { place: Place::new(json), live: None }
+    pub fn new(printer: Printer) -> Self {
+        Self { place: Place::new(printer), live: None, said: (0, None) }
     }
 
     /// Displays an event; the result of a run goes to standard output, everything else to standard error.
@@ -52,10 +63,11 @@ impl EventView {
             Event::Progress(progress) => self.progress(progress),
             Event::Lost { point, attempt, counts } => {
                 let lost = counts.losses();
-                self.note(&format!("point {point}, attempt {attempt}: {lost}; the point is taken again"));
+                self.remark(&format!("point {point}, attempt {attempt}: {lost}; the point is taken again"));
             }
             Event::Film(estimate) => self.film(estimate),
             Event::Vsync(_) | Event::Batch(_) => {}
+            Event::Viewfinder(values) => self.viewfinder(values),
             Event::Ask { text } => self.note(text),
             Event::Live { points, .. } => self.live = Some(*points),
             Event::Finished {
@@ -81,7 +93,7 @@ impl EventView {
                     self.note(&format!("warning: {warning}"));
                 }
                 for found in found {
-                    self.note(found);
+                    self.remark(found);
                 }
                 let summary = match film {
                     Some(film) => show::film_ending(session, state, report.as_deref(), film),
@@ -104,14 +116,46 @@ impl EventView {
     pub fn note(&mut self, text: &str) {
         match &self.place {
             Place::Bar(bar) => bar.suspend(|| eprintln!("{text}")),
-            Place::Lines { .. } | Place::Json => eprintln!("{text}"),
+            Place::Lines { .. } | Place::Quiet | Place::Json => eprintln!("{text}"),
+        }
+    }
+
+    /// Displays a note that a quiet view leaves out.
+    fn remark(&mut self, text: &str) {
+        if !matches!(self.place, Place::Quiet) {
+            self.note(text);
         }
     }
 
     fn state(&mut self, state: RunState) {
         match &self.place {
             Place::Bar(bar) => bar.set_prefix(show::state(state)),
-            _ => self.note(show::state(state)),
+            _ => self.remark(show::state(state)),
+        }
+    }
+
+    fn viewfinder(&mut self, values: &ViewfinderValues) {
+        if let Some(alignment) = values.alignment.as_ref().filter(|found| found.measured != self.said.0) {
+            self.said.0 = alignment.measured;
+            self.remark(&finder_text::alignment(alignment));
+        }
+        if values.problem != self.said.1 {
+            self.said.1.clone_from(&values.problem);
+            values.problem.iter().for_each(|problem| self.note(problem));
+        }
+        let line = finder_text::line(values);
+        match &mut self.place {
+            Place::Bar(bar) => {
+                if let Ok(style) = ProgressStyle::with_template(FINDER) {
+                    bar.set_style(style);
+                }
+                bar.set_message(line);
+            }
+            Place::Lines { told } if told.is_none_or(|told| told.elapsed() >= FINDER_PACE) => {
+                *told = Some(Instant::now());
+                eprintln!("{line}");
+            }
+            Place::Lines { .. } | Place::Quiet | Place::Json => {}
         }
     }
 
@@ -137,15 +181,18 @@ impl EventView {
                 *told = Some(Instant::now());
                 eprintln!("{}/{} stored  {details}", progress.points_stored, progress.points_planned);
             }
-            Place::Lines { .. } | Place::Json => {}
+            Place::Lines { .. } | Place::Quiet | Place::Json => {}
         }
     }
 }
 
 impl Place {
-    fn new(json: bool) -> Self {
-        if json {
+    fn new(printer: Printer) -> Self {
+        if printer.json {
             return Self::Json;
+        }
+        if printer.quiet {
+            return Self::Quiet;
         }
         if !io::stderr().is_terminal() {
             return Self::Lines { told: None };

@@ -11,18 +11,19 @@ const DEVICE: u8 = 40;
 const COMPUTING: u8 = 25;
 
 /// Lets the calling thread, which serves a device and mostly sleeps, run as soon as it wakes: SCHED_FIFO, if the unit
-/// or the user's limits allow it (`LimitRTPRIO`).
-pub fn for_device(device: &str) {
+/// or the user's limits allow it (`LimitRTPRIO`). Returns whether they do.
+pub fn for_device(device: &str) -> bool {
     let priority = ThreadPriorityValue::try_from(DEVICE).map(ThreadPriority::Crossplatform);
     let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
     let set = priority.map(|priority| set_thread_priority_and_policy(thread_native_id(), priority, policy));
-    if let Ok(Err(error)) = set {
+    if let Ok(Err(error)) = &set {
         tracing::info!(
             device,
             ?error,
             "no real-time priority: on a busy host frames may come late; LimitRTPRIO={DEVICE} allows it"
         );
     }
+    matches!(set, Ok(Ok(())))
 }
 
 /// Makes the calling thread, which computes for a long time, yield to the threads that capture.

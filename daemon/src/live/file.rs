@@ -85,7 +85,9 @@ impl LiveFile {
             .mode(MODE)
             .open(path)
             .map_err(failed())?;
-        let live = Self { path: path.to_owned(), file, slot_pixels, slots: Mutex::new(Slots::default()) };
+        // Clients are told the path, and work in other folders.
+        let path = std::path::absolute(path).map_err(failed())?;
+        let live = Self { path, file, slot_pixels, slots: Mutex::new(Slots::default()) };
         // The lock shows the next daemon that this one is alive; the mode must not depend on the umask.
         live.file.try_lock().map_err(|error| failed()(error.into()))?;
         live.file.set_permissions(fs::Permissions::from_mode(MODE)).map_err(failed())?;
@@ -111,6 +113,11 @@ impl LiveFile {
 
     fn offset_of(&self, slot: usize) -> u64 {
         FIRST_SLOT + slot as u64 * self.slot_bytes()
+    }
+
+    /// The side of the blocks of pixels over which an image of this shape is averaged to fit into a slot.
+    pub fn reduction(&self, shape: &[usize]) -> usize {
+        reduction(shape, self.slot_pixels)
     }
 
     /// Publishes an image of one to four axes, the last two of which are rows and columns, under a name; returns its
@@ -161,7 +168,10 @@ impl LiveFile {
         slots.bytes.clear();
         slots.bytes.extend_from_slice(metadata.as_bytes());
         slots.bytes.resize(METADATA_BYTES, 0);
-        slots.bytes.extend(image.iter().flat_map(|pixel| pixel.to_le_bytes()));
+        slots.bytes.resize(METADATA_BYTES + size_of::<f32>() * image.len(), 0);
+        let (bytes, image) = (&mut slots.bytes[METADATA_BYTES..], image.as_standard_layout());
+        let pixels = bytes.chunks_exact_mut(size_of::<f32>()).zip(image.as_slice().unwrap_or_default());
+        pixels.for_each(|(bytes, pixel)| bytes.copy_from_slice(&pixel.to_le_bytes()));
         let (index, sequence) = (slots.next(), slots.sequence + 1);
         let held = Held { lock: slots.held[index].lock + 2, sequence, name: name.into() };
         let header = header(&held, image.shape(), metadata.len(), &slots.bytes, self.offset_of(index));

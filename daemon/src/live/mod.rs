@@ -26,6 +26,9 @@ pub const TOTAL: &str = "total";
 /// Name of the image of a flying dot's newest batch.
 pub const FLOODLIT: &str = "floodlit";
 
+/// Name of the picture of the viewfinder.
+pub const VIEWFINDER: &str = "viewfinder";
+
 /// Why there are no live images.
 #[derive(Debug, thiserror::Error)]
 pub enum LiveError {

@@ -1,5 +1,6 @@
 //! Reads the live file; clients in other languages can be written in the same way.
 
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
@@ -59,6 +60,13 @@ impl LiveReader {
         }
         let slots = u64::from(u32_at(&header, 12));
         let (first_slot, slot_bytes) = (u64_at(&header, 16), u64_at(&header, 24));
+        let file_bytes = file.metadata().map_err(LiveError::io("examine", path))?.len();
+        let end = slots.checked_mul(slot_bytes).and_then(|bytes| bytes.checked_add(first_slot));
+        if slot_bytes < SLOT_HEADER_BYTES as u64 || end.is_none_or(|end| end > file_bytes) {
+            return Err(not_live(format!(
+                "its {slots} slots of {slot_bytes} bytes after byte {first_slot} do not fit into its {file_bytes} bytes"
+            )));
+        }
         Ok(Self { path: path.to_owned(), file, slots, first_slot, slot_bytes })
     }
 
@@ -88,6 +96,23 @@ impl LiveReader {
             thread::yield_now();
         }
         Err(LiveError::Outrun(self.path.clone()))
+    }
+
+    /// The names in the file, each with the sequence number of its newest image.
+    ///
+    /// # Errors
+    /// [`LiveError::Io`].
+    pub fn names(&self) -> Result<BTreeMap<String, u64>, LiveError> {
+        let mut names = BTreeMap::new();
+        for slot in 0..self.slots {
+            let header = self.header(self.first_slot + slot * self.slot_bytes)?;
+            let (sequence, name) = (u64_at(&header, 8), String::from_utf8_lossy(name_of(&header)));
+            if u64_at(&header, 0).is_multiple_of(2) && sequence > 0 {
+                let newest = names.entry(name.into_owned()).or_insert(0);
+                *newest = sequence.max(*newest);
+            }
+        }
+        Ok(names)
     }
 
     fn header(&self, at: u64) -> Result<Header, LiveError> {

@@ -13,10 +13,12 @@ use raysweep_core::{
     Camera, CameraCapabilities, CameraSettings, Clock, Counts, DeviceError, Pattern, Projector, SettingsId,
     SettingsLatency, Shown, Subject, Vsync,
 };
+use raysweep_drivers::projector::external::ShowRequest;
 use raysweep_pipeline::{AssemblerConfig, Pipeline, PipelineConfig, Point, PointRole, Policy, Sink, Stages};
 use raysweep_processing::plane::{PlaneTask, place};
 use raysweep_proto::RunState;
 use raysweep_session::ledger::State;
+use raysweep_session::stack::ArrayName;
 
 pub use self::sink::{PointSink, Verdict};
 use crate::devices::camera::{
@@ -39,15 +41,33 @@ const FIRST_REST: Duration = Duration::from_millis(100);
 const QUEUE_EVENTS: usize = 64;
 
 /// Turns the light off when it goes out of scope, on every way out.
-struct Lit {
+pub struct LitProjector {
     projector: Box<dyn Projector>,
     /// The operator thread, if a person operates the projector; it outlives the projector.
     operator: Option<Operator>,
 }
 
-impl Lit {
+impl LitProjector {
+    /// Takes over the projector of a run, and the questions that it has for its operator, if a person operates it.
+    ///
+    /// # Errors
+    /// When the operator's thread cannot be started.
+    pub fn new(
+        projector: Box<dyn Projector>,
+        questions: Option<Receiver<ShowRequest>>,
+        run: &Run,
+    ) -> Result<Self, DeviceError> {
+        let operator = questions
+            .map(|questions| Operator::start(questions, run.orders.clone(), run.board.clone()))
+            .transpose()?;
+        Ok(Self { projector, operator })
+    }
+
     /// Shows a pattern, or nothing; `None` if the run was ended while waiting for the operator.
-    fn show(&mut self, pattern: Option<&Pattern>, orders: &Orders) -> Result<Option<Shown>, DeviceError> {
+    ///
+    /// # Errors
+    /// When the projector cannot show it.
+    pub fn show(&mut self, pattern: Option<&Pattern>, orders: &Orders) -> Result<Option<Shown>, DeviceError> {
         let shown = match pattern {
             Some(pattern) => self.projector.show(pattern),
             None => self.projector.blank(),
@@ -59,7 +79,7 @@ impl Lit {
     }
 }
 
-impl Drop for Lit {
+impl Drop for LitProjector {
     fn drop(&mut self) {
         if let Some(operator) = &self.operator {
             operator.dismiss();
@@ -78,7 +98,7 @@ pub struct Opened {
     task: Arc<PlaneTask>,
     camera: Box<dyn Camera>,
     vsync: Box<dyn Vsync>,
-    projector: Lit,
+    projector: LitProjector,
     stand: Stand,
     clock: Clock,
     assembler: AssemblerConfig,
@@ -108,10 +128,7 @@ impl Opened {
     pub fn open(rig: &Rig, task: &Arc<PlaneTask>, run: &Run) -> Result<Self, RunError> {
         let Devices { camera, vsync, projector, questions, stand, clock, pace } =
             run.probes.instead_of(rig.open()?);
-        let operator = questions
-            .map(|questions| Operator::start(questions, run.orders.clone(), run.board.clone()))
-            .transpose()?;
-        let projector = Lit { projector, operator };
+        let projector = LitProjector::new(projector, questions, run)?;
         let (geometry, capabilities) = (&task.geometry, camera.capabilities());
         let (found, expected) =
             ((capabilities.height, capabilities.width), (geometry.height, geometry.width));
@@ -224,12 +241,23 @@ pub fn missing(task: &PlaneTask, state: &State) -> Vec<SettingsId> {
         .collect()
 }
 
+/// The regular image, if it is stored and lit points are missing: a resumed run takes it again before them, only to see
+/// whether there is light, because they may be points that see none.
+pub fn regular_again(task: &PlaneTask, missing: &[SettingsId], state: &State) -> Option<SettingsId> {
+    let points = &task.schedule.points;
+    let regular = points.iter().position(|point| point.role == PointRole::Regular)? as u32;
+    let is_lit = |id: &SettingsId| !matches!(points[id.point as usize].role, PointRole::Dark(_));
+    let is_missing = missing.iter().any(|id| id.point == regular);
+    let attempt = state.next_attempt(ArrayName::Regular, 0);
+    (!is_missing && missing.iter().any(is_lit)).then_some(SettingsId { point: regular, attempt })
+}
+
 /// Makes passes over the points while the devices' threads run.
 pub struct Passes<'a> {
     task: &'a PlaneTask,
     camera: &'a CameraThread,
     vsync: &'a VsyncThread,
-    projector: Lit,
+    projector: LitProjector,
     stand: &'a Stand,
     results: &'a Receiver<Verdict>,
     orders: &'a Orders,
@@ -282,6 +310,51 @@ impl Passes<'_> {
         attempts: Vec<Attempt>,
     ) -> Result<(), RunError> {
         self.until_none_is_missing(attempts, |passes, todo, counts| passes.pass(todo, pattern, counts))
+    }
+
+    /// Acquires points under several pictures until none is missing or the run is told to end: picture after picture,
+    /// each shown once, unless points under it have to be taken again. `picture` tells what a point is taken under
+    /// (`None`: no light).
+    ///
+    /// # Errors
+    /// When a device fails, or points fail repeatedly.
+    pub fn acquire_under_each<'p>(
+        &mut self,
+        attempts: Vec<Attempt>,
+        picture: impl Fn(&Attempt) -> Option<&'p Pattern>,
+    ) -> Result<(), RunError> {
+        self.until_none_is_missing(attempts, |passes, todo, counts| {
+            let mut is_over = false;
+            let mut acquired = Ok(());
+            for group in todo.chunk_by(|a, b| picture(a) == picture(b)) {
+                let shown = match passes.orders.go_on() {
+                    true => passes.projector.show(picture(&group[0]), passes.orders),
+                    false => Ok(None),
+                };
+                let not_before_ns = match shown {
+                    Ok(Some(Shown { not_before_ns })) => not_before_ns,
+                    Ok(None) => {
+                        is_over = true;
+                        break;
+                    }
+                    Err(error) => {
+                        acquired = Err(error);
+                        break;
+                    }
+                };
+                let pass = Pass { attempts: group.to_vec(), not_before_ns };
+                let done = passes.camera.acquire(Work::PassOn(pass)).map_err(|Gone| RunError::Interrupted)?;
+                if let Err(error) = done {
+                    acquired = Err(error);
+                    break;
+                }
+            }
+            // Whatever happened, the points so far are decided and counted.
+            let settled = passes.camera.acquire(Work::Settle).map_err(|Gone| RunError::Interrupted)?;
+            let again = passes.failed(&todo, counts);
+            acquired.and(settled)?;
+            Ok((!is_over).then_some(again))
+        })
     }
 
     /// Places a subject in front of the camera; waits for the operator if needed.
@@ -359,8 +432,16 @@ impl Passes<'_> {
         counts: &mut Counts,
     ) -> Result<Option<Vec<Attempt>>, RunError> {
         let Some(shown) = self.projector.show(pattern, self.orders)? else { return Ok(None) };
-        let pass = Pass { attempts: attempts.clone(), not_before_ns: shown.not_before_ns };
+        let not_before_ns = shown.not_before_ns;
+        let pass = Pass { attempts: attempts.clone(), not_before_ns };
         let acquired = self.camera.acquire(Work::Pass(pass)).map_err(|Gone| RunError::Interrupted)?;
+        let again = self.failed(&attempts, counts);
+        acquired?;
+        Ok(Some(again))
+    }
+
+    /// The next attempts after those that failed, once all are decided. Adds up the frame counts.
+    fn failed(&self, attempts: &[Attempt], counts: &mut Counts) -> Vec<Attempt> {
         let mut again = Vec::new();
         // The sink closes the channel when it ends, so this cannot wait forever.
         for verdict in self.results {
@@ -373,7 +454,6 @@ impl Passes<'_> {
                 Verdict::Flushed => break,
             }
         }
-        acquired?;
-        Ok(Some(again))
+        again
     }
 }

@@ -13,12 +13,12 @@ use raysweep_session::ledger::SessionEntry;
 use raysweep_session::{Session, durable};
 
 use crate::probes::Probes;
-use crate::rig::{DotRig, Rig};
+use crate::rig::{Rig, SharedRig};
 
 /// The environment in which a plan is to be run.
 pub struct Lab<'a> {
     /// The rig.
-    pub rig: &'a LabRig,
+    pub rig: &'a SharedRig,
     /// Its camera's capabilities when the daemon started.
     pub camera: &'a CameraCapabilities,
     /// Folder of the sessions.
@@ -27,25 +27,6 @@ pub struct Lab<'a> {
     pub probes: &'a Probes,
     /// Memory limit; results that need more are made in strips of camera rows. `None`: the memory that is free.
     pub memory_limit_bytes: Option<u64>,
-}
-
-/// The daemon's rig.
-#[derive(Clone)]
-pub enum LabRig {
-    /// Raster projector and rolling-shutter camera.
-    Plane(Arc<Rig>),
-    /// Mirror and fast camera.
-    Dots(Arc<DotRig>),
-}
-
-impl LabRig {
-    /// The rig file's text.
-    pub fn text(&self) -> &str {
-        match self {
-            Self::Plane(rig) => &rig.text,
-            Self::Dots(rig) => &rig.text,
-        }
-    }
 }
 
 impl Lab<'_> {

@@ -6,8 +6,10 @@ mod calibration;
 mod darks;
 mod film;
 pub mod lab;
+mod patterns;
 mod response;
 mod sweep;
+mod viewfinder;
 
 use std::path::Path;
 
@@ -16,7 +18,8 @@ use raysweep_processing::calibration::current_in;
 use raysweep_processing::plane::check_mosaic;
 use raysweep_session::ledger::SessionEntry;
 
-use self::lab::{Lab, LabRig, RigOfRun};
+use self::lab::{Lab, RigOfRun};
+use crate::rig::SharedRig;
 use crate::run::life::Foreseen;
 
 /// Predicts a plan's run on the lab's rig.
@@ -27,30 +30,44 @@ pub fn foresee(lab: &Lab<'_>, text: &str) -> Result<Foreseen, ConfigError> {
     let plan = Plan::parse(text)?;
     let in_use = current_in(lab.data);
     let foreseen = match (lab.rig, plan.procedure.clone()) {
-        (LabRig::Plane(rig), Procedure::Sweep(own)) => {
+        (SharedRig::Plane(rig), Procedure::Sweep(own)) => {
             sweep::foresee(lab, RigOfRun::of_new(lab, rig).calibrated(lab, &in_use)?, &plan, own)
         }
-        (LabRig::Plane(rig), Procedure::Darks(own)) => {
+        (SharedRig::Plane(rig), Procedure::Darks(own)) => {
             darks::foresee(lab, RigOfRun::of_new(lab, rig), &plan, own)
         }
-        (LabRig::Plane(rig), Procedure::Calibration(own)) => {
+        (SharedRig::Plane(rig), Procedure::Calibration(own)) => {
             calibration::foresee(lab, RigOfRun::of_new(lab, rig), &plan, own)
         }
-        (LabRig::Plane(rig), Procedure::Film(own)) => {
+        (SharedRig::Plane(rig), Procedure::Patterns(own)) => {
+            patterns::foresee(lab, RigOfRun::of_new(lab, rig).calibrated(lab, &in_use)?, &plan, own)
+        }
+        (SharedRig::Plane(rig), Procedure::Film(own)) => {
             film::foresee(lab, RigOfRun::of_new(lab, rig).calibrated(lab, &in_use)?, &plan, own)
         }
-        (LabRig::Dots(rig), Procedure::Batches(own)) => batches::foresee(lab, rig, &plan, own),
-        (LabRig::Dots(rig), Procedure::Response(own)) => response::foresee(lab, rig, &plan, own),
-        (LabRig::Plane(_), Procedure::Batches(_) | Procedure::Response(_)) => Err(of_another_rig(
+        (SharedRig::Dots(rig), Procedure::Batches(own)) => batches::foresee(lab, rig, &plan, own),
+        (SharedRig::Dots(rig), Procedure::Response(own)) => response::foresee(lab, rig, &plan, own),
+        (SharedRig::Plane(rig), Procedure::Viewfinder(own)) => {
+            viewfinder::foresee_plane(lab, RigOfRun::of_new(lab, rig), &plan, own)
+        }
+        (SharedRig::Dots(rig), Procedure::Viewfinder(own)) => viewfinder::foresee_dots(lab, rig, &plan, own),
+        (SharedRig::Plane(_), Procedure::Batches(_) | Procedure::Response(_)) => Err(of_another_rig(
             &plan,
-            "a plane rig runs plans of kind \"sweep\", \"film\", \"darks\" and \"calibration\"",
+            "a plane rig runs plans of kind \"sweep\", \"film\", \"patterns\", \"darks\", \"calibration\" and \"viewfinder\"",
         )),
         (
-            LabRig::Dots(_),
-            Procedure::Sweep(_) | Procedure::Film(_) | Procedure::Darks(_) | Procedure::Calibration(_),
-        ) => Err(of_another_rig(&plan, "a dot rig runs plans of kind \"batches\" and \"response\"")),
+            SharedRig::Dots(_),
+            Procedure::Sweep(_)
+            | Procedure::Film(_)
+            | Procedure::Patterns(_)
+            | Procedure::Darks(_)
+            | Procedure::Calibration(_),
+        ) => Err(of_another_rig(
+            &plan,
+            "a dot rig runs plans of kind \"batches\", \"response\" and \"viewfinder\"",
+        )),
     }?;
-    if let LabRig::Plane(rig) = lab.rig {
+    if let SharedRig::Plane(rig) = lab.rig {
         check_mosaic(&plan, rig.file.camera.pixel_format)?;
     }
     Ok(foreseen)
@@ -72,29 +89,41 @@ pub fn foresee_rest(
 ) -> Result<Foreseen, Unresumable> {
     let plan = Plan::parse_stored(text)?;
     match (lab.rig, plan.procedure.clone()) {
-        (LabRig::Plane(rig), Procedure::Sweep(own)) => {
+        (SharedRig::Plane(rig), Procedure::Sweep(own)) => {
             // As it was when the session began.
             let rig = RigOfRun::of_begun(rig, begun).calibrated(lab, session)?;
             Ok(sweep::foresee(lab, rig, &plan, own)?)
         }
-        (LabRig::Plane(rig), Procedure::Darks(own)) => {
+        (SharedRig::Plane(rig), Procedure::Patterns(own)) => {
+            let rig = RigOfRun::of_begun(rig, begun).calibrated(lab, session)?;
+            Ok(patterns::foresee(lab, rig, &plan, own)?)
+        }
+        (SharedRig::Plane(rig), Procedure::Darks(own)) => {
             Ok(darks::foresee(lab, RigOfRun::of_begun(rig, begun), &plan, own)?)
         }
-        (LabRig::Plane(rig), Procedure::Calibration(own)) => {
+        (SharedRig::Plane(rig), Procedure::Calibration(own)) => {
             Ok(calibration::foresee(lab, RigOfRun::of_begun(rig, begun), &plan, own)?)
         }
         (_, Procedure::Film(_)) => Err(Unresumable::Past(FILM_IS_PAST)),
         (_, Procedure::Batches(_)) => Err(Unresumable::Past(BATCHES_ARE_PAST)),
         (_, Procedure::Response(_)) => Err(Unresumable::Past(RESPONSE_IS_PAST)),
-        (LabRig::Dots(_), Procedure::Sweep(_) | Procedure::Darks(_) | Procedure::Calibration(_)) => {
-            Err(of_another_rig(&plan, "a dot rig runs plans of kind \"batches\" and \"response\"").into())
-        }
+        (_, Procedure::Viewfinder(_)) => Err(Unresumable::Past(VIEWFINDER_IS_PAST)),
+        (
+            SharedRig::Dots(_),
+            Procedure::Sweep(_) | Procedure::Patterns(_) | Procedure::Darks(_) | Procedure::Calibration(_),
+        ) => Err(of_another_rig(
+            &plan,
+            "a dot rig runs plans of kind \"batches\", \"response\" and \"viewfinder\"",
+        )
+        .into()),
     }
 }
 
 const FILM_IS_PAST: &str = "a film cannot be resumed, because it records one moment: `raysweep process` makes the transports of its stored cycles; run the plan again for another film";
 const BATCHES_ARE_PAST: &str = "batches cannot be resumed, because they record one moment: `raysweep process` makes the products of the stored ones; run the plan again for more";
 const RESPONSE_IS_PAST: &str = "a run of kind \"response\" cannot be resumed: run the plan again";
+const VIEWFINDER_IS_PAST: &str =
+    "a viewfinder stores nothing, so there is nothing to resume: start another one";
 
 /// Why no session of this plan can be resumed on any rig.
 pub fn past(text: &str) -> Option<&'static str> {
@@ -102,7 +131,10 @@ pub fn past(text: &str) -> Option<&'static str> {
         Procedure::Film(_) => Some(FILM_IS_PAST),
         Procedure::Batches(_) => Some(BATCHES_ARE_PAST),
         Procedure::Response(_) => Some(RESPONSE_IS_PAST),
-        Procedure::Sweep(_) | Procedure::Darks(_) | Procedure::Calibration(_) => None,
+        Procedure::Viewfinder(_) => Some(VIEWFINDER_IS_PAST),
+        Procedure::Sweep(_) | Procedure::Patterns(_) | Procedure::Darks(_) | Procedure::Calibration(_) => {
+            None
+        }
     }
 }
 

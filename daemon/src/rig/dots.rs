@@ -21,8 +21,10 @@ use crate::mirror;
 pub struct DotRig {
     /// Contents of its rig file.
     pub file: DotRigFile,
-    /// The file's text, which sessions store.
+    /// The file's text with absolute paths, which sessions store.
     pub text: String,
+    /// The file's text as it was written, which earlier versions stored.
+    pub(super) written: String,
     sim: Option<Arc<DotsRig>>,
     /// The file's folder, which its paths are relative to.
     folder: PathBuf,
@@ -57,6 +59,7 @@ impl DotRig {
 
     pub(super) fn of(mut file: DotRigFile, source: Source<'_>) -> Result<Self, RigError> {
         let folder = source.folder().to_owned();
+        let text = source.for_sessions(&file.places, file.paths());
         file.plan_folders.iter_mut().for_each(|allowed| *allowed = folder.join(&*allowed));
         let setup = DotsSetup {
             format: file.camera.pixel_format,
@@ -76,7 +79,7 @@ impl DotRig {
             }
             _ => None,
         };
-        Ok(Self { file, text: source.text, sim, folder })
+        Ok(Self { file, text, written: source.text, sim, folder })
     }
 
     /// The simulated rig, if the camera is simulated.
@@ -116,7 +119,23 @@ impl DotRig {
                 truth: Some(truth),
             });
         }
-        let (camera, stand): (Box<dyn Camera>, _) = match self.file.camera.driver {
+        let (camera, stand) = self.open_real_camera(frame_rate_hz)?;
+        Ok(DotDevices { camera, mirror, stand, clock: Clock::real(), pace: self.pace(), truth: None })
+    }
+
+    /// Opens only the camera, if it is real or a recording, at this frame rate.
+    ///
+    /// # Errors
+    /// When it cannot be opened.
+    pub fn open_camera(&self, frame_rate_hz: f64) -> Result<Option<Box<dyn Camera>>, RigError> {
+        match self.sim {
+            Some(_) => Ok(None),
+            None => self.open_real_camera(frame_rate_hz).map(|(camera, _)| Some(camera)),
+        }
+    }
+
+    fn open_real_camera(&self, frame_rate_hz: f64) -> Result<(Box<dyn Camera>, Stand), RigError> {
+        Ok(match self.file.camera.driver {
             DotCameraDriver::Replay => {
                 let Some(replay) = &self.file.camera.replay else {
                     return Err(RigError::Config("[camera.replay] is missing".into()));
@@ -127,8 +146,7 @@ impl DotRig {
             }
             DotCameraDriver::Aravis => (self.open_aravis(frame_rate_hz)?, Stand::Operator),
             _ => (self.open_v4l2(frame_rate_hz)?, Stand::Operator),
-        };
-        Ok(DotDevices { camera, mirror, stand, clock: Clock::real(), pace: self.pace(), truth: None })
+        })
     }
 
     /// Opens only the mirror, if it has its own driver, which stores its state in the daemon's data folder.

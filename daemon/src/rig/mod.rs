@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use raysweep_config::rig::plane::{CameraDriver, DrmSection, ProjectorDriver};
 use raysweep_config::rig::vsync::VsyncDriver;
-use raysweep_config::{AnyRigFile, ConfigError, RigFile};
+use raysweep_config::{AnyRigFile, ConfigError, Places, RigFile};
 use raysweep_core::{Camera, CameraCapabilities, Clock, DeviceError, Projector, Vsync, io_text};
 use raysweep_drivers::camera::v4l2::{self, V4l2Setup};
 use raysweep_drivers::projector::drm::{DrmConfig, DrmProjector, Timing};
@@ -41,6 +41,9 @@ pub enum RigError {
     /// A device cannot be opened.
     #[error(transparent)]
     Device(#[from] DeviceError),
+    /// Several devices cannot be opened.
+    #[error("{}", .0.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n"))]
+    Several(Vec<RigError>),
 }
 
 /// A rig of either kind.
@@ -77,6 +80,43 @@ impl AnyRig {
     }
 }
 
+/// A rig of either kind, which runs share.
+#[derive(Clone)]
+pub enum SharedRig {
+    /// Raster projector and rolling-shutter camera.
+    Plane(Arc<Rig>),
+    /// Mirror and fast camera.
+    Dots(Arc<DotRig>),
+}
+
+impl From<AnyRig> for SharedRig {
+    fn from(rig: AnyRig) -> Self {
+        match rig {
+            AnyRig::Plane(rig) => Self::Plane(rig.into()),
+            AnyRig::Dots(rig) => Self::Dots(rig.into()),
+        }
+    }
+}
+
+impl SharedRig {
+    /// Whether a session's rig file is this rig's.
+    pub fn is_of(&self, stored: &str) -> bool {
+        let written = match self {
+            Self::Plane(rig) => &rig.written,
+            Self::Dots(rig) => &rig.written,
+        };
+        stored == self.text() || stored == written
+    }
+
+    /// The rig file's text, as sessions store it.
+    pub fn text(&self) -> &str {
+        match self {
+            Self::Plane(rig) => &rig.text,
+            Self::Dots(rig) => &rig.text,
+        }
+    }
+}
+
 /// The text of a rig file and its path.
 struct Source<'a> {
     path: &'a Path,
@@ -95,6 +135,17 @@ impl<'a> Source<'a> {
         self.path.parent().unwrap_or(Path::new("."))
     }
 
+    /// The text for a session, in whose folder relative paths would lead nowhere: with absolute ones, as far as there is
+    /// something at them.
+    fn for_sessions(&self, places: &Places, paths: Vec<(Vec<String>, PathBuf)>) -> String {
+        let absolute = |(keys, path): (Vec<String>, PathBuf)| {
+            let found = path.is_relative().then(|| self.folder().join(&path).canonicalize())?.ok()?;
+            Some((keys, found.to_str()?.to_owned()))
+        };
+        let strings: Vec<_> = paths.into_iter().filter_map(absolute).collect();
+        places.with_strings(&self.text, &strings)
+    }
+
     fn shown(&self, error: &ConfigError) -> RigError {
         RigError::Config(error.render(&self.path.display().to_string(), &self.text))
     }
@@ -104,8 +155,10 @@ impl<'a> Source<'a> {
 pub struct Rig {
     /// Contents of its rig file.
     pub file: RigFile,
-    /// The file's text, which sessions store.
+    /// The file's text with absolute paths, which sessions store.
     pub text: String,
+    /// The file's text as it was written, which earlier versions stored.
+    written: String,
     /// The simulated rig, if any device is simulated.
     sim: Option<Arc<PlaneRig>>,
 }
@@ -126,6 +179,38 @@ pub struct Devices {
     pub clock: Clock,
     /// Whether the devices or the pipeline set the pace.
     pub pace: Pace,
+}
+
+/// A projector, and its requests to its operator, if a person operates it.
+type OpenProjector = (Box<dyn Projector>, Option<Receiver<ShowRequest>>);
+
+/// The devices of a rig: each open, or why it is not.
+pub struct OpenedEach {
+    /// The camera, the clock of its timestamps, and what places subjects in front of it.
+    pub camera: Result<(Box<dyn Camera>, Clock, Stand), RigError>,
+    /// The watcher of the VSYNC line.
+    pub vsync: Result<Box<dyn Vsync>, RigError>,
+    /// The projector.
+    pub projector: Result<OpenProjector, RigError>,
+    /// Whether the devices or the pipeline set the pace.
+    pub pace: Pace,
+}
+
+impl OpenedEach {
+    /// All devices, or the errors of those that are not open.
+    fn all(self) -> Result<Devices, RigError> {
+        let Self { camera, vsync, projector, pace } = self;
+        match (camera, vsync, projector) {
+            (Ok((camera, clock, stand)), Ok(vsync), Ok((projector, questions))) => {
+                Ok(Devices { camera, vsync, projector, questions, stand, clock, pace })
+            }
+            (camera, vsync, projector) => {
+                let failed = [camera.err(), vsync.err(), projector.err()];
+                let mut errors: Vec<RigError> = failed.into_iter().flatten().collect();
+                Err(if errors.len() == 1 { errors.remove(0) } else { RigError::Several(errors) })
+            }
+        }
+    }
 }
 
 /// What sets the pace of a run.
@@ -158,6 +243,7 @@ impl Rig {
     }
 
     fn of(mut file: RigFile, source: Source<'_>) -> Result<Self, RigError> {
+        let text = source.for_sessions(&file.places, file.paths());
         file.sim.bench = file.sim.bench.map(|bench| source.folder().join(bench));
         let simulate = || {
             simulate(&file, source.folder()).map_err(|error| {
@@ -166,7 +252,7 @@ impl Rig {
             })
         };
         let sim = file.has_simulated_device().then(simulate).transpose()?;
-        Ok(Self { sim: sim.map(Arc::new), file, text: source.text })
+        Ok(Self { sim: sim.map(Arc::new), file, text, written: source.text })
     }
 
     /// Projector row that row 0 of its camera sees.
@@ -206,37 +292,44 @@ impl Rig {
     /// Opens all devices.
     ///
     /// # Errors
-    /// The first device that cannot be opened.
+    /// The devices that cannot be opened.
     pub fn open(&self) -> Result<Devices, RigError> {
+        let devices = self.open_each()?.all()?;
+        self.check_rows(devices.camera.capabilities())?;
+        Ok(devices)
+    }
+
+    /// Opens each device, even if another one cannot be opened.
+    ///
+    /// # Errors
+    /// For a rig file whose devices do not go together.
+    pub fn open_each(&self) -> Result<OpenedEach, RigError> {
         self.check_pace()?;
         let mut simulated = Simulated::open(self)?;
-        let vsync = match vsync::open(&self.file.vsync)? {
-            Some(real) => real,
-            None => simulated.vsync()?,
+        let vsync = match vsync::open(&self.file.vsync) {
+            Ok(Some(real)) => Ok(real),
+            Ok(None) => simulated.vsync(),
+            Err(error) => Err(error.into()),
         };
-        let (projector, questions): (Box<dyn Projector>, _) = match self.file.projector.driver {
-            ProjectorDriver::Drm => (Box::new(self.open_drm()?), None),
+        let projector: Result<OpenProjector, _> = match self.file.projector.driver {
+            ProjectorDriver::Drm => self.open_drm().map(|drm| (Box::new(drm) as _, None)),
             ProjectorDriver::External => {
                 // A run that waits for its operator can be cancelled, so there is no need for a timeout.
                 let (operated, questions) = External::new(Duration::MAX);
-                (simulated.followed(operated), Some(questions))
+                Ok((simulated.followed(operated), Some(questions)))
             }
-            ProjectorDriver::Sim => (simulated.projector()?, None),
+            ProjectorDriver::Sim => simulated.projector().map(|projector| (projector, None)),
         };
         // Real devices use the host's clock, even if others of the rig are simulated.
-        let (camera, clock) = match self.file.camera.driver {
-            CameraDriver::Sim => simulated.camera()?,
-            CameraDriver::Aravis => (self.open_aravis()?, Clock::real()),
-            CameraDriver::V4l2 => (self.open_v4l2()?, Clock::real()),
-        };
-        self.check_rows(camera.capabilities())?;
-        let stand = match self.file.camera.driver {
-            CameraDriver::Sim => simulated.stand()?,
-            CameraDriver::Aravis | CameraDriver::V4l2 => Stand::Operator,
+        let real = |camera| (camera, Clock::real(), Stand::Operator);
+        let camera = match self.file.camera.driver {
+            CameraDriver::Sim => simulated.camera_and_stand(),
+            CameraDriver::Aravis => self.open_aravis().map(real),
+            CameraDriver::V4l2 => self.open_v4l2().map(real),
         };
         let by_the_clock = self.file.sim.realtime || self.file.camera.driver != CameraDriver::Sim;
         let pace = if by_the_clock { Pace::Devices } else { Pace::Pipeline };
-        Ok(Devices { camera, vsync, projector, questions, stand, clock, pace })
+        Ok(OpenedEach { camera, vsync, projector, pace })
     }
 
     /// Real devices use the host's clock, so simulated devices beside them must run in real time.
@@ -319,6 +412,19 @@ mod tests {
         // The simulated scene has 128 rows, and the projector 720.
         let Err(error) = load("sim") else { panic!("the scene does not fit") };
         assert!(matches!(error, RigError::Config(_)), "{error}");
+    }
+
+    #[test]
+    fn the_rig_files_of_the_shopping_lists_simulate_nothing() {
+        let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/rigs");
+        for name in ["lab-gige.toml", "lab-mipi.toml", "lab-dots.toml"] {
+            let is_real = match AnyRig::load(&rigs.join(name)) {
+                Ok(AnyRig::Plane(rig)) => rig.simulated().is_none() && !rig.file.has_simulated_device(),
+                Ok(AnyRig::Dots(rig)) => rig.simulated().is_none() && rig.has_real_mirror(),
+                Err(error) => panic!("{error}"),
+            };
+            assert!(is_real, "{name}");
+        }
     }
 
     #[test]

@@ -57,9 +57,12 @@ impl Simulated {
         }
     }
 
-    /// The camera, and the clock of its timestamps.
-    pub(super) fn camera(&mut self) -> Result<(Box<dyn Camera>, Clock), RigError> {
-        self.camera.take().ok_or_else(|| not_simulated("camera"))
+    /// The camera, the clock of its timestamps, and what places subjects before it.
+    pub(super) fn camera_and_stand(&mut self) -> Result<(Box<dyn Camera>, Clock, Stand), RigError> {
+        let (camera, subject) = (self.camera.take(), self.subject.take());
+        let both = camera.zip(subject).ok_or_else(|| not_simulated("camera"))?;
+        let ((camera, clock), subject) = both;
+        Ok((camera, clock, Stand::Simulated(subject)))
     }
 
     /// The watcher of the VSYNC line.
@@ -84,11 +87,6 @@ impl Simulated {
             Some(light) => Box::new(Followed { operated, light }),
             None => Box::new(operated),
         }
-    }
-
-    /// What places subjects before the camera.
-    pub(super) fn stand(&mut self) -> Result<Stand, RigError> {
-        self.subject.take().map(Stand::Simulated).ok_or_else(|| not_simulated("camera"))
     }
 }
 

@@ -24,6 +24,7 @@ impl StatusBoard {
     /// The board of an idle daemon for a rig of this kind.
     pub fn new(rig: &str) -> Self {
         let status = Status {
+            role: None,
             version: env!("CARGO_PKG_VERSION").into(),
             rig: rig.into(),
             state: RunState::Idle,
@@ -33,6 +34,7 @@ impl StatusBoard {
             vsync: None,
             vsync_clock: None,
             film: None,
+            viewfinder: None,
             settings_latency: None,
             ended: None,
             error: None,
@@ -72,6 +74,7 @@ impl StatusBoard {
         if next == RunState::Preparing {
             (status.session, status.progress, status.vsync, status.error) = (None, None, None, None);
             (status.ended, status.warnings) = (None, Vec::new());
+            status.viewfinder = None;
             (status.film, status.settings_latency, status.vsync_clock) = (None, None, None);
         }
         let event = Event::State { state: next, session: status.session.clone() };
@@ -136,9 +139,11 @@ impl StatusBoard {
         match &event {
             Event::Progress(progress) => status.progress = Some(progress.clone()),
             Event::Vsync(vsync) => status.vsync = Some(*vsync),
+            Event::Viewfinder(values) => status.viewfinder = Some(values.clone()),
             Event::Film(estimate) => status.film = Some(estimate.film.clone()),
             Event::Finished { state, warnings, .. } => {
                 (status.ended, status.warnings) = (Some(state.clone()), warnings.clone());
+                status.viewfinder = None;
             }
             _ => {}
         }

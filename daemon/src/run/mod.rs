@@ -3,6 +3,7 @@
 pub mod board;
 pub mod error;
 pub mod life;
+pub mod look;
 pub mod orders;
 pub mod patience;
 pub mod progress;

@@ -3,6 +3,8 @@
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use super::look::WantedLook;
+
 /// An order to a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Order {
@@ -20,6 +22,8 @@ pub enum Order {
 pub struct Orders {
     given: Mutex<Given>,
     changed: Condvar,
+    /// What a viewfinder is to show.
+    pub look: WantedLook,
 }
 
 /// The order in force, and the pauses so far.
@@ -34,7 +38,7 @@ struct Given {
 impl Default for Orders {
     fn default() -> Self {
         let given = Given { order: Order::Go, paused_since: None, paused: Duration::ZERO };
-        Self { given: Mutex::new(given), changed: Condvar::new() }
+        Self { given: Mutex::new(given), changed: Condvar::new(), look: WantedLook::default() }
     }
 }
 

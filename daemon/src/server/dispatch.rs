@@ -1,8 +1,8 @@
 //! Maps a method's name and parameters to a call of the daemon.
 
 use raysweep_proto::{
-    CheckParams, DesignParams, Empty, ErrorCode, Event, Method, ResumeParams, RpcError, RunParams,
-    UseCalibrationParams, describe, params,
+    CheckParams, DesignParams, DoctorParams, Empty, ErrorCode, Event, Method, ResumeParams, Role, RpcError,
+    RunParams, Status, UseCalibrationParams, ViewfinderParams, describe, params,
 };
 use serde::Serialize;
 use serde_json::{Map, Value};
@@ -20,28 +20,34 @@ pub(super) struct CallResult {
 
 /// Whether a call may take long, or reads many files.
 pub(super) fn computes(method: Method) -> bool {
-    matches!(method, Method::Check | Method::Design | Method::Sessions | Method::Calibrations)
+    matches!(
+        method,
+        Method::Check | Method::Design | Method::Doctor | Method::Sessions | Method::Calibrations
+    )
 }
 
 /// Executes a call; may block.
 pub(super) fn carry_out(
     control: &dyn Control,
     method: Method,
+    role: Role,
     given: Map<String, Value>,
 ) -> Result<CallResult, RpcError> {
     let result = match method {
         Method::Check => control.check(&params::<CheckParams>(given)?.plan).and_then(value),
         Method::Design => control.design(&params::<DesignParams>(given)?).and_then(value),
+        Method::Doctor => control.doctor(&params::<DoctorParams>(given)?).and_then(value),
         Method::Run => control.run(params::<RunParams>(given)?).and_then(value),
         Method::Resume => control.resume(params::<ResumeParams>(given)?).and_then(value),
         Method::Describe => none(given).and_then(|()| value(describe(env!("CARGO_PKG_VERSION")))),
-        Method::Status => none(given).and_then(|()| value(control.status())),
+        Method::Status => none(given).and_then(|()| value(Status { role: Some(role), ..control.status() })),
         Method::Sessions => none(given).and_then(|()| control.sessions()).and_then(value),
         Method::Calibrations => none(given).and_then(|()| control.calibrations()).and_then(value),
         Method::UseCalibration => {
             let params = params::<UseCalibrationParams>(given)?;
             control.use_calibration(&params.session).and_then(done)
         }
+        Method::Viewfinder => control.viewfinder(&params::<ViewfinderParams>(given)?).and_then(done),
         Method::Pause => none(given).and_then(|()| control.pause()).and_then(done),
         Method::Continue => none(given).and_then(|()| control.go_on()).and_then(done),
         Method::Cancel => none(given).and_then(|()| control.cancel()).and_then(done),

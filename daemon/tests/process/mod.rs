@@ -1,7 +1,9 @@
 //! Processes that tests start. None outlives its test, however the test ends.
 
 use std::os::unix::process::CommandExt;
-use std::process::{Child, Command, ExitStatus};
+use std::process::{Child, ChildStdout, Command, ExitStatus};
+use std::thread;
+use std::time::{Duration, Instant};
 
 use nix::sys::prctl::set_pdeathsig;
 use nix::sys::signal::{Signal, kill};
@@ -21,6 +23,13 @@ impl Process {
 
 #[allow(dead_code, reason = "not every test needs all of it")]
 impl Process {
+    /// As [`Self::start`], with the standard output that the command pipes.
+    pub fn with_output(command: &mut Command) -> (Self, ChildStdout) {
+        let mut process = Self::start(command);
+        let output = process.0.stdout.take().unwrap();
+        (process, output)
+    }
+
     pub fn signal(&self, signal: Signal) {
         kill(Pid::from_raw(self.0.id().try_into().unwrap()), signal).unwrap();
     }
@@ -38,5 +47,18 @@ impl Drop for Process {
     fn drop(&mut self) {
         let _ = self.0.kill();
         let _ = self.0.wait();
+    }
+}
+
+/// Waits until `look` returns a value.
+#[allow(dead_code, reason = "not every test needs it")]
+pub fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
+    let patience = Instant::now() + Duration::from_secs(60);
+    loop {
+        if let Some(found) = look() {
+            return found;
+        }
+        assert!(Instant::now() < patience, "{what}");
+        thread::sleep(Duration::from_millis(10));
     }
 }

@@ -51,6 +51,10 @@ fn a_run_is_followed_to_its_end_and_the_exit_code_tells_how_it_went() {
         assert!(err.contains("37/75 stored") && err.contains("4 lost (camera gap)"), "{text}: {err}");
         assert_eq!(out.contains("report.html"), text != "fault", "{text}: {out}");
         assert_eq!(err.contains("unplugged"), text == "fault", "{text}: {err}");
+        let (quiet_exit, quiet_out, quiet_err) = run(&daemon, &["run", "--quiet", &plan(&daemon, text)]);
+        assert_eq!((quiet_exit, quiet_out), (exit, out), "{text}");
+        assert!(!quiet_err.contains("stored") && !quiet_err.contains("lost"), "{text}: {quiet_err}");
+        assert_eq!(quiet_err.contains("unplugged"), text == "fault", "{text}: {quiet_err}");
     }
 }
 
@@ -95,6 +99,7 @@ fn every_other_command_prints_for_people_and_for_programs() {
         (vec!["check", &plan], "0.023 (0.015 to 0.075); noise 0.023", "/advice/expected/total/median"),
         (vec!["check", &plan], "warning    few points\n\n[sweep]\naverage = 8\n", "/advice/better/table"),
         (vec!["design", &plan, "--light", "2s"], "# warning: not reached\nkind = \"sweep\"\n", "/plan"),
+        (vec!["doctor"], "warning  vsync  2 false edges", "/checks/0/remedy"),
         (vec!["sessions"], "20260101-000000_fake  complete   75/75  fake", "/0/state"),
         (vec!["run", &plan, "--detach"], "/data/20260101-000000_fake", ""),
         (vec!["pause"], "pauses", ""),

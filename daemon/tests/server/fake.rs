@@ -9,9 +9,10 @@ use raysweep::control::Control;
 use raysweep::server::{Access, Limits, Listening, serve_within};
 use raysweep_core::{Counts, LossCause, VsyncStats};
 use raysweep_proto::{
-    BetterPlan, CalibrationInfo, CheckReport, Client, DesignParams, DesignReport, ErrorCode, ErrorRange,
-    Event, ExpectedError, MirrorStatus, NoiseEstimate, NoiseSource, PlanAdvice, Progress, ResumeParams,
-    RpcError, RunParams, RunState, SessionInfo, Started, Status,
+    BetterPlan, CalibrationInfo, CheckReport, Client, DesignParams, DesignReport, DoctorCheck, DoctorParams,
+    DoctorReport, ErrorCode, ErrorRange, Event, ExpectedError, Grade, MirrorStatus, NoiseEstimate,
+    NoiseSource, PlanAdvice, Progress, ResumeParams, RpcError, RunParams, RunState, SessionInfo, Started,
+    Status, ViewfinderParams,
 };
 use tokio::runtime::Runtime;
 use tokio::sync::{broadcast, oneshot};
@@ -123,6 +124,16 @@ fn expected() -> ExpectedError {
     ExpectedError { total, noise: total, bias: total, calibration: total, band: total }
 }
 
+pub fn examined() -> DoctorReport {
+    let check = DoctorCheck {
+        name: "vsync".into(),
+        grade: Grade::Warning,
+        found: "2 false edges".into(),
+        remedy: Some("look at the line".into()),
+    };
+    DoctorReport { user: "lab".into(), version: "1".into(), checks: vec![check] }
+}
+
 pub fn designed() -> DesignReport {
     DesignReport {
         points: 15,
@@ -192,6 +203,7 @@ impl Control for Fake {
     fn status(&self) -> Status {
         let state = *self.state.lock().unwrap();
         Status {
+            role: None,
             version: "1".into(),
             rig: "plane".into(),
             state,
@@ -201,6 +213,7 @@ impl Control for Fake {
             vsync: Some(VsyncStats { edges: 10, period_us: 16_666.7, ..VsyncStats::default() }),
             vsync_clock: None,
             film: None,
+            viewfinder: None,
             settings_latency: None,
             ended: None,
             error: None,
@@ -223,6 +236,10 @@ impl Control for Fake {
 
     fn design(&self, _: &DesignParams) -> Result<DesignReport, RpcError> {
         Ok(designed())
+    }
+
+    fn doctor(&self, _: &DoctorParams) -> Result<DoctorReport, RpcError> {
+        Ok(examined())
     }
 
     fn run(&self, params: RunParams) -> Result<Started, RpcError> {
@@ -262,6 +279,10 @@ impl Control for Fake {
 
     fn arm_light(&self) -> Result<(), RpcError> {
         Ok(())
+    }
+
+    fn viewfinder(&self, _: &ViewfinderParams) -> Result<(), RpcError> {
+        Err(RpcError::new(ErrorCode::NotRunning, "no viewfinder is running"))
     }
 
     fn sessions(&self) -> Result<Vec<SessionInfo>, RpcError> {

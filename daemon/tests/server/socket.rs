@@ -2,12 +2,13 @@
 
 use std::io::{BufRead, BufReader, ErrorKind, Read, Write};
 use std::os::unix::net::UnixStream;
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use raysweep::server::{Access, Limits, Peer};
 use raysweep_proto::{
-    Client, ClientError, ErrorCode, Event, MAX_CLIENTS, MAX_MESSAGE_BYTES, Method, Role, RunParams, RunState,
+    Client, ClientError, DoctorParams, ErrorCode, Event, MAX_CLIENTS, MAX_MESSAGE_BYTES, Method, Role,
+    RunParams, RunState, ViewfinderParams,
 };
 use serde_json::{Value, json};
 
@@ -214,11 +215,14 @@ fn one_user_does_not_take_all_places() {
 #[test]
 fn a_user_who_waits_for_a_computation_does_not_hold_another() {
     static OTHER: AtomicBool = AtomicBool::new(false);
+    static IDENTIFIED: AtomicUsize = AtomicUsize::new(0);
     let identify = |_: &tokio::net::UnixStream| {
+        IDENTIFIED.fetch_add(1, Ordering::SeqCst);
         Ok(Peer { uid: 100_000 + u32::from(OTHER.load(Ordering::Relaxed)), gid: 65534 })
     };
     let daemon = Daemon::with(Limits::default(), Access::identified_by(None, identify));
     let gate = daemon.fake.gate.lock().unwrap();
+    let before = IDENTIFIED.load(Ordering::SeqCst);
     let ask = b"{\"jsonrpc\":\"2.0\",\"id\":1,\"method\":\"check\",\"params\":{\"plan\":\"wait\"}}\n";
     let asking: Vec<_> = (0..4)
         .map(|_| {
@@ -228,7 +232,7 @@ fn a_user_who_waits_for_a_computation_does_not_hold_another() {
         })
         .collect();
     // One of the four computes, and the others wait without a thread of the daemon.
-    while daemon.fake.checks.load(Ordering::SeqCst) == 0 {
+    while daemon.fake.checks.load(Ordering::SeqCst) == 0 || IDENTIFIED.load(Ordering::SeqCst) < before + 4 {
         std::thread::sleep(Duration::from_millis(1));
     }
     OTHER.store(true, Ordering::Relaxed);
@@ -257,6 +261,7 @@ fn who_only_observes_is_forbidden_to_drive() {
     let daemon = Daemon::with(Limits::default(), access);
     let mut client = daemon.client();
     let driving = [
+        client.doctor(&DoctorParams::default()).map(drop),
         client.run(&RunParams::default()).map(drop),
         client.resume("old").map(drop),
         client.pause(),
@@ -264,6 +269,7 @@ fn who_only_observes_is_forbidden_to_drive() {
         client.cancel(),
         client.arm_light(),
         client.use_calibration("old"),
+        client.viewfinder(&ViewfinderParams::default()),
     ];
     assert_eq!(driving.len(), Method::ALL.iter().filter(|method| method.role() == Role::Operator).count());
     for result in driving {

@@ -10,11 +10,11 @@ mod process;
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use ndarray::Axis;
 use nix::sched::{CloneFlags, unshare};
-use process::Process;
+use process::{Process, wait_for};
 use raysweep::rig::Rig;
 use raysweep_config::{FilmPlan, Plan, Procedure};
 use raysweep_core::{CameraSettings, Counts, FramePool, Pattern, SettingsId, Shutter, ns_from_us};
@@ -231,18 +231,6 @@ fn assert_camera_is_left_as_set(rig: &Rig, plan: &FilmPlan) {
 
 fn start(program: &str, arguments: &[&str]) -> Process {
     Process::start(Command::new(program).args(arguments).stdout(Stdio::null()).stderr(Stdio::null()))
-}
-
-/// Waits until `look` returns a value.
-fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
-    let patience = Instant::now() + Duration::from_secs(60);
-    loop {
-        if let Some(found) = look() {
-            return found;
-        }
-        assert!(Instant::now() < patience, "{what}");
-        thread::sleep(Duration::from_millis(10));
-    }
 }
 
 /// Each stored image is the scene's image under the settings in the ledger, times the number of frames.

@@ -5,6 +5,7 @@
 //! determine the mirror's position and move it to the origin, light off first.
 
 mod error;
+mod greet;
 mod guardian;
 mod light;
 mod lines;
@@ -18,6 +19,7 @@ mod rules;
 mod sequence;
 mod state;
 
+pub use greet::greet;
 pub use guardian::{Guardian, park_when_closed};
 pub use light::{LightGuard, LightState, NoLight, arm_light};
 pub use mti::{Mti, MtiCommand, MtiConfig, MtiDrive, MtiReply, parse_mti};

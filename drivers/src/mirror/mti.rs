@@ -140,6 +140,13 @@ impl MtiLine {
         }
     }
 
+    /// Asks the controller at this port what it is. Its high voltage stays as it is.
+    pub(super) fn greet(port: &Path) -> Result<String, DeviceError> {
+        let (mut line, model) = Self::enter(port, MechanicalDeg(1.0))?;
+        line.tell(MtiCommand::Exit, REPLY_WAIT)?;
+        Ok(model)
+    }
+
     /// Enters the command mode, or detects that the controller is already in it.
     fn enter(port: &Path, full_scale: MechanicalDeg) -> Result<(Self, String), DeviceError> {
         let mut line = Self { port: LinePort::open(port, BAUD, "\n", parse_mti)?, full_scale };

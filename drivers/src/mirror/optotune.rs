@@ -130,6 +130,8 @@ pub fn parse_optotune(bytes: &[u8]) -> Parsed<OptotuneReply> {
     })
 }
 
+const MODEL: &str = "Optotune MR-E-2";
+
 /// The controller and its separate laser.
 pub struct OptotuneLine {
     port: LinePort<OptotuneReply>,
@@ -186,6 +188,14 @@ impl PointController for OptotuneLine {
     }
 }
 
+/// Asks the controller at this port for a sign of life. Its laser's port is not opened, which would switch it.
+pub(super) fn greet(port: &Path) -> Result<String, DeviceError> {
+    let port = LinePort::open(port, BAUD, "\r\n", parse_optotune)?;
+    let mut line = OptotuneLine { port, laser: Box::new(NoLaser), lit: false };
+    line.tell(OptotuneCommand::Start)?;
+    Ok(MODEL.into())
+}
+
 /// A mirror driven by an MR-E-2.
 pub type Optotune = PointMirror<OptotuneLine>;
 
@@ -201,7 +211,7 @@ impl PointMirror<OptotuneLine> {
         let mut line = OptotuneLine::open(&port, laser)?;
         line.go(MirrorPoint { tilt: Tilt::ORIGIN, light: 0 })?;
         let reach = Reach::Optotune { port, node, laser_port };
-        Ok(PointMirror::parked(state, limits, light, reach, line, "Optotune MR-E-2".into()))
+        Ok(PointMirror::parked(state, limits, light, reach, line, MODEL.into()))
     }
 }
 

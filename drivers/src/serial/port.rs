@@ -2,6 +2,7 @@
 
 use std::io::{self, Read, Write};
 use std::path::Path;
+use std::thread;
 use std::time::{Duration, Instant};
 
 use nix::errno::Errno;
@@ -14,6 +15,10 @@ use super::wire::{Parsed, Receiver};
 const WRITE_WAIT: Duration = Duration::from_millis(5);
 /// Sending a message fails if the port accepts no byte for this long.
 const SEND_WAIT: Duration = Duration::from_millis(500);
+
+/// A process that is ending, such as a guardian that has parked the mirror, gives its port back within this time.
+const LOCK_WAIT: Duration = Duration::from_millis(500);
+const LOCK_PACE: Duration = Duration::from_millis(10);
 
 /// After this long without a reply, none is on its way: a line at 115,200 baud and a USB adapter's 16 ms are faster.
 const SILENCE: Duration = Duration::from_millis(50);
@@ -28,28 +33,41 @@ pub(crate) struct Port {
     received: Receiver,
 }
 
+/// What the crate says of a port that another program has opened.
+fn is_locked(error: &serialport::Error) -> bool {
+    error.kind() == serialport::ErrorKind::NoDevice
+}
+
 impl Port {
     /// Opens the port of a device, 8N1 without flow control; errors name the device.
     pub fn open(device: &'static str, path: &Path, baud: u32) -> Result<Self, DeviceError> {
         let name = path.display().to_string();
-        let tty = serialport::new(&name, baud)
-            .data_bits(DataBits::Eight)
-            .parity(Parity::None)
-            .stop_bits(StopBits::One)
-            .flow_control(FlowControl::None)
-            .timeout(WRITE_WAIT)
-            .open_native()
-            .map_err(|error| {
-                let kind = match error.kind() {
-                    // What the crate says of a port that another program has opened.
-                    serialport::ErrorKind::NoDevice => DeviceErrorKind::Busy,
-                    serialport::ErrorKind::Io(io::ErrorKind::PermissionDenied) => DeviceErrorKind::NotReady,
-                    // Missing, or a node whose device was pulled out (ENXIO, ENODEV, EIO).
-                    _ => DeviceErrorKind::Disconnected,
-                };
-                let what = format!("cannot open {name}: {error}: check the cable, the rig file's port, and who else has it open");
-                DeviceError::new(device, kind, what)
-            })?;
+        let began = Instant::now();
+        let opened = loop {
+            let opened = serialport::new(&name, baud)
+                .data_bits(DataBits::Eight)
+                .parity(Parity::None)
+                .stop_bits(StopBits::One)
+                .flow_control(FlowControl::None)
+                .timeout(WRITE_WAIT)
+                .open_native();
+            match &opened {
+                Err(error) if is_locked(error) && began.elapsed() < LOCK_WAIT => thread::sleep(LOCK_PACE),
+                _ => break opened,
+            }
+        };
+        let tty = opened.map_err(|error| {
+            let kind = match error.kind() {
+                _ if is_locked(&error) => DeviceErrorKind::Busy,
+                serialport::ErrorKind::Io(io::ErrorKind::PermissionDenied) => DeviceErrorKind::NotReady,
+                // Missing, or a node whose device was pulled out (ENXIO, ENODEV, EIO).
+                _ => DeviceErrorKind::Disconnected,
+            };
+            let what = format!(
+                "cannot open {name}: {error}: check the cable, the rig file's port, and who else has it open"
+            );
+            DeviceError::new(device, kind, what)
+        })?;
         Ok(Self { device, tty, name, received: Receiver::default() })
     }
 

@@ -191,7 +191,9 @@ impl World {
         let planes = self.bench.scene.planes();
         match subject {
             Subject::Plane(number) if number >= planes => {
-                let what = format!("plane {number}: sim.dots.plane_depths has {planes}, counted from 0");
+                let what = format!(
+                    "plane {number}: the simulated rig has {planes}, counted from 0; see sim.dots.plane_depths"
+                );
                 return Err(not_there(what));
             }
             Subject::Board | Subject::Cap => {

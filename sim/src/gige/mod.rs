@@ -6,7 +6,7 @@ mod control;
 mod faults;
 mod features;
 mod genicam;
-mod gvcp;
+pub mod gvcp;
 mod gvsp;
 mod locks;
 mod registers;

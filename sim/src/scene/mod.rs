@@ -29,8 +29,10 @@ mod vector;
 
 use std::ops::Range;
 use std::path::Path;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use ndarray::{Array2, Array3, Array4, ArrayView2, Axis, s};
+use rayon::prelude::*;
 
 pub use error::SceneError;
 pub use motion::SceneMotion;
@@ -54,7 +56,15 @@ pub struct Scene {
     pub projector_column: Option<Array2<f32>>,
     /// Objects of a built-in scene; empty for scenes defined by row transport only.
     panels: Vec<Panel>,
+    /// Images under rows with the same columns lit, the newest last.
+    under_columns: Mutex<Vec<UnderColumns>>,
 }
+
+/// Weights of a row's columns, and the images `[V, H, W, C]` under each row alone.
+type UnderColumns = (Vec<f32>, Arc<Array4<f32>>);
+
+/// Most memory of these images.
+const MOST_UNDER_COLUMNS_BYTES: usize = 512 << 20;
 
 impl Scene {
     /// Loads a scene from a `.npz` file: `T` float32 (or float64, converted) `[V, H, W]` or
@@ -143,7 +153,8 @@ impl Scene {
             panel.add_transport(transport.slice_mut(s![rows.clone(), rows.clone(), columns.clone(), ..]));
             projector_column.slice_mut(s![rows, columns]).assign(&panel.middle_columns());
         }
-        Ok(Self { transport, projector_column: Some(projector_column), panels })
+        let under_columns = Mutex::default();
+        Ok(Self { transport, projector_column: Some(projector_column), panels, under_columns })
     }
 
     fn checked(
@@ -162,7 +173,7 @@ impl Scene {
         {
             return Err(SceneError::Value { origin: origin.into(), index, value });
         }
-        Ok(Self { transport, projector_column, panels: Vec::new() })
+        Ok(Self { transport, projector_column, panels: Vec::new(), under_columns: Mutex::default() })
     }
 
     /// Number of projector rows, V.
@@ -218,6 +229,32 @@ impl Scene {
             }
         }
         Ok(image)
+    }
+
+    /// The images `[V, H, W, C]` under each row alone, lit with these weights of its columns. A series of patterns has
+    /// few different rows, so they are kept.
+    ///
+    /// # Errors
+    /// As [`Scene::render`].
+    pub fn under_columns(&self, columns: &[f32]) -> Result<Arc<Array4<f32>>, SceneError> {
+        let kept = || self.under_columns.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((_, images)) = kept().iter().find(|(known, _)| known == columns) {
+            return Ok(images.clone());
+        }
+        let mut images = Array4::zeros(self.transport.dim());
+        images.axis_iter_mut(Axis(0)).into_par_iter().enumerate().try_for_each(|(v, mut image)| {
+            let mut lit = Array2::zeros((self.rows(), columns.len()));
+            lit.row_mut(v).iter_mut().zip(columns).for_each(|(lit, &weight)| *lit = weight);
+            image.assign(&self.render(lit.view(), &self.full_window())?);
+            Ok::<(), SceneError>(())
+        })?;
+        let images = Arc::new(images);
+        let mut kept = kept();
+        kept.push((columns.to_vec(), images.clone()));
+        let most = (MOST_UNDER_COLUMNS_BYTES / (images.len() * size_of::<f32>()).max(1)).max(1);
+        let too_many = kept.len().saturating_sub(most);
+        kept.drain(..too_many);
+        Ok(images)
     }
 
     /// Renders the image `[H, W, C]` under any pattern, from the scene's objects.

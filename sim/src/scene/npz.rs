@@ -12,6 +12,7 @@ use ndarray_npy::{NpzReader, NpzWriter, ReadNpyError, ReadNpzError, WriteNpzErro
 
 use super::Scene;
 use super::error::SceneError;
+use crate::stored_float::StoredFloat;
 
 const TRANSPORT: &str = "T";
 const PROJECTOR_UV: &str = "proj_uv";
@@ -90,13 +91,8 @@ fn read(
         }
         source => SceneError::Unreadable { path: path.into(), source },
     };
-    match npz.by_name::<OwnedRepr<f32>, IxDyn>(array) {
-        Err(ReadNpzError::Npy(ReadNpyError::WrongDescriptor(_))) => {
-            let wide = npz.by_name::<OwnedRepr<f64>, IxDyn>(array).map_err(failed)?;
-            Ok(wide.mapv(|value| value as f32))
-        }
-        other => other.map_err(failed),
-    }
+    let stored = npz.by_name::<OwnedRepr<StoredFloat>, IxDyn>(array).map_err(failed)?;
+    Ok(stored.map(|StoredFloat(value)| *value))
 }
 
 pub(super) fn save(scene: &Scene, path: &Path) -> Result<(), SceneError> {

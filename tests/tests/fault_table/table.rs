@@ -487,11 +487,18 @@ pub const TABLE: &[(&str, &[Row])] = &[
     ]),
     ("Process", &[
         [
-            "SIGKILL, at any moment of a sweep",
-            "resumed to the same bits",
+            "SIGKILL at any moment of a run, or of a resumed run",
+            "sweeps, darks and calibrations are resumed, the others processed, to the same bits",
             "kept",
-            "daemon/tests/crash.rs",
-            "fifty_kills_and_resumes_end_like_a_run_without_any",
+            "daemon/tests/kills/main.rs",
+            "random_kills_lose_nothing_and_change_no_bit",
+        ],
+        [
+            "SIGKILL of `raysweep process`",
+            "results are old or new, or `raysweep verify` says that they are mixed; processing again makes them new",
+            "kept",
+            "daemon/tests/kills/main.rs",
+            "random_kills_lose_nothing_and_change_no_bit",
         ],
         [
             "SIGKILL in a film",

@@ -4,9 +4,11 @@ mod batches;
 mod calibration;
 mod darks;
 mod film;
+mod patterns;
 mod response;
 mod sweep;
 mod tables;
+mod viewfinder;
 
 use serde::Deserialize;
 use serde_json::Map;
@@ -15,9 +17,11 @@ pub use self::batches::{BatchesPlan, PathPlan, PlanePlan, Shape};
 pub use self::calibration::CalibrationPlan;
 pub use self::darks::DarksPlan;
 pub use self::film::FilmPlan;
+pub use self::patterns::{PatternPlan, PatternRefused, PatternsPlan};
 pub use self::response::ResponsePlan;
 pub use self::sweep::{Axis, GridPlan, SweepPlan};
 pub use self::tables::{ProductTable, StageTable, products_of_argument};
+pub use self::viewfinder::{FinderSubject, ViewfinderPlan};
 use crate::document::{Document, ReadingPurpose};
 use crate::{ConfigError, ConfigMistake, Places};
 
@@ -51,6 +55,10 @@ pub enum Procedure {
     Darks(DarksPlan),
     /// Images of a white board, from which a plane rig is calibrated.
     Calibration(CalibrationPlan),
+    /// Images of a few settings under each of many pictures, from which direct and global light are separated.
+    Patterns(PatternsPlan),
+    /// Live pictures for focusing, aligning and exposing.
+    Viewfinder(ViewfinderPlan),
 }
 
 /// The procedures, by their names in plans.
@@ -63,11 +71,21 @@ enum Kind {
     Response,
     Darks,
     Calibration,
+    Patterns,
+    Viewfinder,
 }
 
 impl Kind {
-    const ALL: [Self; 6] =
-        [Self::Sweep, Self::Film, Self::Batches, Self::Response, Self::Darks, Self::Calibration];
+    const ALL: [Self; 8] = [
+        Self::Sweep,
+        Self::Film,
+        Self::Batches,
+        Self::Response,
+        Self::Darks,
+        Self::Calibration,
+        Self::Patterns,
+        Self::Viewfinder,
+    ];
 
     /// Its name in plans, which is also the name of its table.
     fn name(self) -> &'static str {
@@ -78,6 +96,8 @@ impl Kind {
             Self::Response => "response",
             Self::Darks => "darks",
             Self::Calibration => "calibration",
+            Self::Patterns => "patterns",
+            Self::Viewfinder => "viewfinder",
         }
     }
 
@@ -91,6 +111,14 @@ impl Kind {
             Self::Response => read(document, table, ResponsePlan::check, Procedure::Response),
             Self::Darks => read(document, table, DarksPlan::check, Procedure::Darks),
             Self::Calibration => read(document, table, CalibrationPlan::check, Procedure::Calibration),
+            Self::Patterns => {
+                let patterns: Option<Vec<PatternPlan>> = document.take(PATTERN);
+                let plan: PatternsPlan = document.take_or_default(table)?;
+                let plan = plan.with_patterns(patterns);
+                plan.check(document);
+                Some(Procedure::Patterns(plan))
+            }
+            Self::Viewfinder => read(document, table, ViewfinderPlan::check, Procedure::Viewfinder),
         }
     }
 
@@ -99,10 +127,13 @@ impl Kind {
         match self {
             Self::Sweep | Self::Film => Some(tables::DEMUX),
             Self::Batches => Some("denoise"),
-            Self::Response | Self::Darks | Self::Calibration => None,
+            Self::Response | Self::Darks | Self::Calibration | Self::Patterns | Self::Viewfinder => None,
         }
     }
 }
+
+/// The tables of pictures.
+const PATTERN: &str = "pattern";
 
 /// Whether plans have this kind.
 pub(crate) fn is_kind(name: &str) -> bool {
@@ -130,6 +161,8 @@ impl Procedure {
             Self::Response(_) => Kind::Response,
             Self::Darks(_) => Kind::Darks,
             Self::Calibration(_) => Kind::Calibration,
+            Self::Patterns(_) => Kind::Patterns,
+            Self::Viewfinder(_) => Kind::Viewfinder,
         };
         kind.name()
     }
@@ -188,10 +221,15 @@ impl Plan {
                 document.refuse(&[key], format!("kind = \"{own}\" takes no [[{key}]]: leave it out"));
             }
         }
+        if document.drop_key(PATTERN) {
+            let message = format!("kind = \"{own}\" takes no [[{PATTERN}]]: use kind = \"patterns\"");
+            document.refuse(&[PATTERN], message);
+        }
         tables::check_stages(stages.iter().flatten(), &mut document);
         tables::check_products(products.iter().flatten(), &mut document);
         let stages = stages.unwrap_or_else(|| default_stages.into_iter().collect());
-        let known = ["kind", "name", "stage", "product"].into_iter().chain(Kind::ALL.map(Kind::name));
+        let known =
+            ["kind", "name", "stage", "product", PATTERN].into_iter().chain(Kind::ALL.map(Kind::name));
         document.refuse_others(&known.collect::<Vec<_>>());
         let places = document.places().clone();
         document.finish(procedure.map(|procedure| Self { name, procedure, stages, products, places }))

@@ -223,7 +223,8 @@ impl SweepPlan {
         for (grid, path) in self.grids().zip(std::iter::once(vec!["sweep"]).chain(extra)) {
             are_grids &= grid.check(&path, document);
         }
-        let points: usize = self.grids().map(|grid| grid.delay_us.len() * grid.exposure_us.len()).sum();
+        let lengths = self.grids().map(|grid| grid.delay_us.len().saturating_mul(grid.exposure_us.len()));
+        let points = lengths.fold(0, usize::saturating_add);
         if are_grids && points > MAX_POINTS {
             let message =
                 format!("the sweep has {points} points: at most {MAX_POINTS} are allowed; split it");

@@ -8,7 +8,9 @@ use serde::Deserialize;
 use super::aravis::AravisConfig;
 use super::replay::ReplayConfig;
 use super::v4l2::V4l2Config;
-use super::{RigKind, default_black_dn, default_pixel_format, default_reopen_s, default_white_dn};
+use super::{
+    RigKind, default_black_dn, default_pixel_format, default_reopen_s, default_white_dn, scene_file,
+};
 use crate::document::Document;
 use crate::sim::DotsConfig;
 use crate::{ConfigError, Places};
@@ -218,6 +220,27 @@ fn default_limits() -> MirrorLimits {
 }
 
 impl DotRigFile {
+    /// What the file refers to, by paths that are relative to it or absolute, with the keys that give them.
+    pub fn paths(&self) -> Vec<(Vec<String>, PathBuf)> {
+        let keys = |keys: &[&str]| keys.iter().map(|key| (*key).to_owned()).collect::<Vec<_>>();
+        let dots = &self.sim.dots;
+        let scene = scene_file(&dots.scene).map(|scene| (keys(&["sim", "dots", "scene"]), scene.to_owned()));
+        let mut paths: Vec<_> = scene.into_iter().collect();
+        for (index, file) in dots.plane_files.iter().enumerate() {
+            paths.push((keys(&["sim", "dots", "plane_files", &index.to_string()]), file.clone()));
+        }
+        for (index, folder) in self.plan_folders.iter().enumerate() {
+            paths.push((keys(&["plan_folders", &index.to_string()]), folder.clone()));
+        }
+        paths.extend(
+            self.camera
+                .replay
+                .iter()
+                .map(|replay| (keys(&["camera", "replay", "path"]), replay.path.clone())),
+        );
+        paths
+    }
+
     /// Reads a rig file.
     ///
     /// # Errors

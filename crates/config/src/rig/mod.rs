@@ -7,6 +7,8 @@ pub mod replay;
 pub mod v4l2;
 pub mod vsync;
 
+use std::path::Path;
+
 use raysweep_core::PixelFormat;
 use serde::Deserialize;
 
@@ -76,4 +78,9 @@ pub(super) fn full_scale_dn(format: PixelFormat) -> f64 {
 
 pub(super) fn default_pixel_format() -> PixelFormat {
     PixelFormat::Mono12
+}
+
+/// A scene, unless it is the name of a built-in one.
+fn scene_file(scene: &Path) -> Option<&Path> {
+    scene.extension().is_some().then_some(scene)
 }

@@ -1,6 +1,6 @@
 //! `rig.toml` of a plane rig: its devices and their timing.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use raysweep_core::{PixelFormat, Raster};
 use serde::Deserialize;
@@ -10,6 +10,7 @@ use super::v4l2::V4l2Config;
 use super::vsync::{VsyncDriver, VsyncSection};
 use super::{
     RigKind, default_black_dn, default_pixel_format, default_reopen_s, default_white_dn, full_scale_dn,
+    scene_file,
 };
 use crate::document::Document;
 use crate::sim::{SimConfig, SimSpot};
@@ -304,6 +305,13 @@ impl RigFile {
         let rig = Self { camera, vsync, projector, calibration, auto_resume, sim, places };
         rig.check(&mut document);
         document.finish(Some(rig))
+    }
+
+    /// What the file refers to, by paths that are relative to it or absolute, with the keys that give them.
+    pub fn paths(&self) -> Vec<(Vec<String>, PathBuf)> {
+        let of = |key: &str, path: &Path| (vec!["sim".to_owned(), key.to_owned()], path.to_owned());
+        let bench = self.sim.bench.iter().map(|bench| of("bench", bench));
+        scene_file(&self.sim.scene).map(|scene| of("scene", scene)).into_iter().chain(bench).collect()
     }
 
     /// Whether any of its devices is simulated, in this process or on a bench.

@@ -33,6 +33,9 @@ pub struct DotsConfig {
     pub dump_indices: Vec<u32>,
     /// Distances of the Lambertian planes that can be placed in front of the camera, relative to the scene's distance.
     pub plane_depths: Vec<f64>,
+    /// Files with images of planes under the dots of a scene file, instead of the planes at `plane_depths`: each array
+    /// `[N, H, W]` or `[N, H, W, 3]` in them is a plane. Paths are relative to the rig file.
+    pub plane_files: Vec<PathBuf>,
     /// `[sim.dots.dot]`
     pub dot: SimDot,
     /// `[sim.dots.mirror]`
@@ -57,6 +60,7 @@ impl Default for DotsConfig {
             trailing_index: None,
             dump_indices: vec![0],
             plane_depths: vec![1.0, 1.1],
+            plane_files: Vec::new(),
             dot: SimDot::default(),
             mirror: SimMirror::default(),
             camera: SimDotCamera::default(),

@@ -5,6 +5,6 @@ mod plane;
 
 pub use self::dots::{DotsConfig, SimDot, SimDotCamera, SimDotSensor, SimMirror};
 pub use self::plane::{
-    FlickerPhase, RowTable, SimAmbient, SimBeam, SimBoard, SimCamera, SimConfig, SimProjector, SimSensor,
-    SimSpot, SimTruth, SimVsync,
+    FlickerPhase, RowTable, SimAmbient, SimBeam, SimBoard, SimCamera, SimConfig, SimLens, SimProjector,
+    SimSensor, SimSpot, SimTruth, SimVsync,
 };

@@ -76,6 +76,8 @@ pub struct SimProjector {
     pub phase_jitter_us: f64,
     /// Number of VSYNC edges between setting a new picture and its light.
     pub video_latency_frames: u32,
+    /// `[sim.projector.lens]`
+    pub lens: SimLens,
 }
 
 impl Default for SimProjector {
@@ -86,7 +88,28 @@ impl Default for SimProjector {
             spot: SimSpot::Uniform,
             phase_jitter_us: 0.0,
             video_latency_frames: 1, // [A]
+            lens: SimLens::default(),
         }
+    }
+}
+
+/// A lens, whose picture is blurred by its distance from the focus: each point becomes an evenly lit disc, 2 pixels
+/// across at the ends of the depth of field.
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SimLens {
+    /// Where its focus ring is.
+    pub position_mm: f64,
+    /// Where its focus ring would have to be.
+    pub focus_mm: f64,
+    /// Depth of field, along the positions of the ring.
+    pub depth_of_field_mm: f64,
+}
+
+impl Default for SimLens {
+    /// In focus.
+    fn default() -> Self {
+        Self { position_mm: 0.0, focus_mm: 0.0, depth_of_field_mm: 1.0 }
     }
 }
 
@@ -198,6 +221,8 @@ pub struct SimCamera {
     pub chunk_exposure: bool,
     /// Fraction of frames that are exposed and then lost in transit.
     pub dropped: f64,
+    /// `[sim.camera.lens]`
+    pub lens: SimLens,
 }
 
 impl Default for SimCamera {
@@ -212,6 +237,7 @@ impl Default for SimCamera {
             late_frames_max: 0,
             chunk_exposure: true,
             dropped: 0.0,
+            lens: SimLens::default(),
         }
     }
 }

@@ -12,7 +12,9 @@ use raysweep_transport::dots::{
 const LEARNT_FROM_BATCHES: usize = 2;
 /// Largest distance of a waiting frame from its position expected from the last trailing dot: a drift of one frame
 /// per batch, over the two batches for which it may wait.
-const DRIFT_FRAMES: u64 = 2;
+const DRIFT_FRAMES: i64 = 2;
+/// Largest number of batches whose frames wait for their index.
+const BATCHES_WAITING: usize = 2;
 
 /// Consecutive exposures without a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -44,6 +46,26 @@ impl DotScan {
     /// Whether a frame of the batch shows the scene: neither trailing dot nor beam dump.
     pub fn is_scene(&self, index: u32) -> bool {
         index != self.trailing_index && !self.background_indices.contains(&index)
+    }
+
+    /// Most frames of the beam dump, and of their neighbours, that are kept until their index is known. A pool needs as
+    /// many buffers beside those in the workers, or the camera waits for ever.
+    pub fn frames_kept(&self) -> usize {
+        let near = self.near_background().iter().filter(|is_near| **is_near).count();
+        // Beyond whole batches wait a few frames by which batches drift.
+        BATCHES_WAITING * (near + DRIFT_FRAMES as usize)
+    }
+
+    /// Whether the frame expected to have an index may be one of the beam dump, `[dots]`.
+    fn near_background(&self) -> Vec<bool> {
+        let dots = i64::from(self.dots);
+        let mut near = vec![false; self.dots as usize];
+        for &index in &self.background_indices {
+            for drift in -DRIFT_FRAMES..=DRIFT_FRAMES {
+                near[(i64::from(index) + drift).rem_euclid(dots) as usize] = true;
+            }
+        }
+        near
     }
 }
 
@@ -125,6 +147,10 @@ pub(super) struct Gatherer<S> {
     pub sink: S,
     cutter: Cutter,
     pending: VecDeque<Option<Waiting>>,
+    /// Number of pending frames whose pixels are kept, and the most that there may be.
+    kept: usize,
+    most_kept: usize,
+    near_background: Vec<bool>,
     first_pending: u64,
     decided: Vec<Decided>,
     building: Option<Building>,
@@ -149,6 +175,9 @@ impl<S: CutSink> Gatherer<S> {
         Self {
             cutter: Cutter::Learning(Vec::with_capacity(learning)),
             pending: VecDeque::with_capacity(2 * learning),
+            kept: 0,
+            most_kept: scan.frames_kept(),
+            near_background: scan.near_background(),
             first_pending: 0,
             decided: Vec::with_capacity(2 * learning),
             building: None,
@@ -186,6 +215,7 @@ impl<S: CutSink> Gatherer<S> {
         self.sink.frame(&frame);
         let (start_ns, end_ns) = (frame.stamp.exposure_start_ns, frame.stamp.host_ns);
         let frame = self.may_be_background(seen.id).then_some(frame);
+        self.kept += usize::from(frame.is_some());
         self.pending.push_back(Some(Waiting { id: seen.id, column, frame, lost_before, start_ns, end_ns }));
         self.decided.clear();
         match &mut self.cutter {
@@ -253,12 +283,8 @@ impl<S: CutSink> Gatherer<S> {
     /// Whether a frame that has just arrived may be one of the beam dump.
     fn may_be_background(&self, id: u64) -> bool {
         let Some((last_id, last_index)) = self.last else { return false };
-        let dots = u64::from(self.scan.dots);
-        let expected = (u64::from(last_index) + id.saturating_sub(last_id)) % dots;
-        self.scan.background_indices.iter().any(|&index| {
-            let distance = expected.abs_diff(u64::from(index));
-            distance.min(dots - distance) <= DRIFT_FRAMES
-        })
+        let expected = (u64::from(last_index) + id.saturating_sub(last_id)) % u64::from(self.scan.dots);
+        self.kept < self.most_kept && self.near_background[expected as usize]
     }
 
     fn settle_all(&mut self, spare: &mut dyn FnMut(SparseColumn)) {
@@ -277,6 +303,7 @@ impl<S: CutSink> Gatherer<S> {
 
     fn settle(&mut self, arrival: u64, waiting: Waiting, fate: Fate, spare: &mut dyn FnMut(SparseColumn)) {
         let Waiting { id, column, frame, lost_before, start_ns, end_ns } = waiting;
+        self.kept -= usize::from(frame.is_some());
         let mut place = None;
         match fate {
             // Its id has arrived before, so it is not an exposure of its own.

@@ -1,6 +1,8 @@
+use proptest::prelude::*;
 use rand_xoshiro::Xoshiro256PlusPlus;
 use rand_xoshiro::rand_core::{Rng, SeedableRng};
 use std::sync::Arc;
+use std::time::Duration;
 
 use raysweep_core::{Counts, Frame, FramePool, FrameStamp, LossCause, PixelFormat};
 use raysweep_transport::dots::{
@@ -56,7 +58,8 @@ fn frame(pool: &FramePool, format: PixelFormat, step: u64) -> Frame {
 }
 
 fn frame_of(pool: &FramePool, format: PixelFormat, step: u64, counts: &[u16]) -> Frame {
-    let mut data = pool.take();
+    let data = pool.take_within(Duration::from_secs(60));
+    let mut data = data.expect("frames of the beam dump hold all buffers");
     format.pack_into(counts, &mut data).unwrap();
     let at_ns = step as i64 * 1000;
     let stamp = FrameStamp {
@@ -149,10 +152,19 @@ fn cut_frames(
         queue_frames: 4,
         policy: Policy::Wait,
     };
-    let (flow, mut input) = DotsFlow::start(config, Kept::default()).unwrap();
     let pool = FramePool::new(40, format.frame_bytes(shape().pixels()));
+    flow_of(config, &pool, frames)
+}
+
+fn flow_of(
+    config: DotsFlowConfig,
+    pool: &FramePool,
+    frames: impl IntoIterator<Item = (u64, Vec<u16>, Vec<Loss>)>,
+) -> Gathered<Kept> {
+    let format = config.format;
+    let (flow, mut input) = DotsFlow::start(config, Kept::default()).unwrap();
     for (step, counts, lost_before) in frames {
-        let arrival = Arrival { frame: frame_of(&pool, format, step, &counts), lost_before };
+        let arrival = Arrival { frame: frame_of(pool, format, step, &counts), lost_before };
         assert!(input.offer(arrival).is_ok());
     }
     drop(input);
@@ -244,6 +256,50 @@ fn the_background_follows_a_change_of_the_room_by_its_weight() {
     for batch in [10, 15, 25] {
         let expected = f64::from(CHANGE_DN) * KEPT.powi(batch as i32 - 7);
         assert!((beyond(batch) - expected).abs() < 0.2, "{batch}: {}, expected {expected}", beyond(batch));
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+    /// Whichever frames go into the beam dump and whatever is lost, the buffers suffice that a scan asks for.
+    #[test]
+    fn frames_of_the_beam_dump_leave_room_for_others_and_all_of_them_count(
+        dumped in proptest::collection::btree_set(0..DOTS - 1, 1..DOTS as usize),
+        lost in proptest::collection::btree_set(40..20 * u64::from(DOTS), 0..12),
+    ) {
+        let format = PixelFormat::Mono16;
+        let is_dumped = |step: u64| dumped.contains(&((step % u64::from(DOTS)) as u32));
+        // Frames of the beam dump show the room, which brightens.
+        let room = |step: u64| vec![100 + (step / 7) as u16; shape().pixels()];
+        let counts = |step: u64| if is_dumped(step) { room(step) } else { counts(step) };
+        let steps = 0..20 * u64::from(DOTS);
+        let frames = steps.clone().filter(|step| !lost.contains(step)).map(|step| (step, counts(step), Vec::new()));
+        let Sensor { correction, background, floor } = sensor(format);
+        let mut expected = background.clone();
+        let scan = DotScan { background_indices: dumped.iter().copied().collect(), ..scan(18) };
+        let config = DotsFlowConfig {
+            format,
+            saturation_dn: 4000,
+            stage: denoise(format),
+            correction,
+            background,
+            floor,
+            threads: 2,
+            queue_frames: 1,
+            policy: Policy::Wait,
+            scan,
+        };
+        // In the two queues, in the workers, with the gatherer, and with the camera.
+        let pool = FramePool::new(config.scan.frames_kept() + 8, format.frame_bytes(shape().pixels()));
+        let gathered = flow_of(config, &pool, frames);
+        if lost.is_empty() {
+            // Frames count from the first that arrives after the trailing dot has been learnt.
+            let learnt = 2 * u64::from(DOTS) + 1;
+            for step in steps.filter(|step| *step >= learnt && is_dumped(*step)) {
+                expected.push(&room(step)).unwrap();
+            }
+            prop_assert_eq!(gathered.background.mean(), expected.mean());
+        }
     }
 }
 

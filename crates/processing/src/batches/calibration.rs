@@ -5,13 +5,14 @@ use raysweep_session::dots::Dots;
 use raysweep_session::ledger::State;
 use raysweep_session::{Result, Session};
 use raysweep_transport::dots::calibrate::{
-    Centroids, Confusion, Correspondence, Drift, Footprints, Fundamental, PointSpreads,
+    Centroids, Confusion, Drift, EpipolarFit, Extension, Footprints, Fundamental, PointSpreads,
 };
-use raysweep_transport::dots::product::{column_energies, coverage};
+use raysweep_transport::dots::product::{REFERENCE_WIDTH_PX, column_energies, coverage};
 use raysweep_transport::dots::{Batch, DotsError, FrameShape};
 use serde_json::{Map, json};
 
 use super::columns::from_stored;
+use super::task::DotTask;
 
 /// A pixel belongs to a dot's spot from this share of the dot's peak on.
 const FOOTPRINT_LEVEL: f64 = 0.5;
@@ -19,20 +20,28 @@ const FOOTPRINT_LEVEL: f64 = 0.5;
 /// dots counts as global light: at one half, that was a tenth of all light on the simulated V-groove.
 const OVERLAP_LEVEL: f64 = 0.1;
 
+/// Standard deviation of dots from their epipolar lines beyond which these are doubtful, in pixels of a frame that is
+/// 1024 pixels wide.
+const MOST_EPIPOLAR_PX: f64 = 3.0;
+/// Share of outliers beyond which the lines are doubtful.
+const MOST_OUTLIERS: f64 = 0.25;
+
 /// Calibration of the dots from the planes.
 pub(super) struct Calibration {
     /// Positions on the first plane, averaged over its batches.
     pub centroids: Centroids,
-    /// Dots that share pixels on the first plane.
+    /// The same with the positions that dots beside the plane would have on it.
+    pub places: Centroids,
+    /// How these were placed; else the standard deviation of the dots from the mirror's path, in pixels.
+    pub extension: std::result::Result<Extension, f64>,
+    /// Dots that share pixels on the first plane, or would.
     pub confusion: Confusion,
     /// How strongly all dots together cover each pixel.
     pub coverage: Array3<f32>,
     /// Light of each dot on the plane.
     pub energies: Vec<f64>,
     /// The epipolar geometry between a dot's position on the first plane and the camera, or why there is none.
-    pub fundamental: std::result::Result<Fundamental, String>,
-    /// Root mean square distance of the second plane's dots from their epipolar lines.
-    pub epipolar_px: Option<f64>,
+    pub epipolar: std::result::Result<EpipolarFit, String>,
     /// Radius of a dot on the plane, if any dot stands out from its surroundings.
     pub radius_px: Option<f64>,
     /// Number of dots whose spot is not one connected piece.
@@ -57,10 +66,10 @@ pub(super) fn read_batch(
 
 impl Calibration {
     /// Calibrates from the stored batches of the planes; `None` without planes.
-    pub fn of(dots: &Dots, shape: FrameShape, state: &State, problems: &mut Vec<String>) -> Option<Self> {
+    pub fn of(dots: &Dots, task: &DotTask, state: &State, problems: &mut Vec<String>) -> Option<Self> {
         let mut batches_of = |plane: usize| {
             let entries = state.batches().filter(|entry| entry.plane == Some(plane));
-            let read = entries.filter_map(|entry| match read_batch(dots, shape, entry) {
+            let read = entries.filter_map(|entry| match read_batch(dots, task.shape, entry) {
                 Ok((batch, _)) => Some((entry.batch, batch)),
                 Err(problem) => {
                     problems.push(problem);
@@ -73,11 +82,33 @@ impl Calibration {
         if first.is_empty() {
             return None;
         }
-        let made = Self::made(&first, &second);
-        made.map_err(|error| problems.push(format!("the calibration planes cannot be used: {error}"))).ok()
+        let made = Self::made(&first, &second, &task.directions);
+        let made = made
+            .map_err(|error| problems.push(format!("the calibration planes cannot be used: {error}")))
+            .ok()?;
+        problems.extend(made.doubts(task));
+        Some(made)
     }
 
-    fn made(first: &[(usize, Batch)], second: &[(usize, Batch)]) -> std::result::Result<Self, DotsError> {
+    /// What makes the epipolar geometry doubtful.
+    fn doubts(&self, task: &DotTask) -> Option<String> {
+        let EpipolarFit { dots, outliers, sd_px, .. } = *self.epipolar.as_ref().ok()?;
+        let most_px = MOST_EPIPOLAR_PX * task.shape.width() as f64 / REFERENCE_WIDTH_PX;
+        let share = outliers as f64 / dots as f64;
+        (sd_px > most_px || share > MOST_OUTLIERS).then(|| {
+            format!(
+                "the epipolar geometry is doubtful: on the second plane, {outliers} of {dots} dots lie far from their \
+                 epipolar lines, the others {sd_px:.2} px (standard deviation; up to {most_px:.2} px is usual): \
+                 check that nothing moved between the planes, and that both fill the field"
+            )
+        })
+    }
+
+    fn made(
+        first: &[(usize, Batch)],
+        second: &[(usize, Batch)],
+        directions: &[Option<[f64; 2]>],
+    ) -> std::result::Result<Self, DotsError> {
         let centroids_of = |batch: &Batch| Centroids::new(batch, &Footprints::new(batch, FOOTPRINT_LEVEL)?);
         let all: Vec<(usize, Centroids)> = first
             .iter()
@@ -88,21 +119,36 @@ impl Calibration {
         let centroids = mean(all.into_iter().map(|(_, centroids)| centroids).collect());
         // One batch is used where averaging would blur: the last one, which is nearest in time to the scene.
         let plane = &first[first.len() - 1].1;
-        let spreads = PointSpreads::new(plane)?;
-        let not_unimodal = spreads.unimodal.iter().filter(|unimodal| !**unimodal).count();
+        let spreads = PointSpreads::new(plane, &centroids)?;
+        let seen = centroids.xy.iter().zip(&spreads.unimodal);
+        let not_unimodal = seen.filter(|(xy, unimodal)| xy.is_some() && !**unimodal).count();
         let behind = second
             .iter()
             .map(|(_, batch)| centroids_of(batch))
             .collect::<std::result::Result<Vec<_>, DotsError>>()?;
         let behind = (!behind.is_empty()).then(|| mean(behind));
-        let (fundamental, epipolar_px) = epipolar_geometry(&centroids, behind.as_ref());
+        let (places, extension) = match centroids.extended(directions) {
+            Ok((places, extension)) => (places, Ok(extension)),
+            Err(sd_px) => (centroids.clone(), Err(sd_px)),
+        };
+        let epipolar = match &behind {
+            Some(behind) => {
+                Fundamental::from_planes(&places.xy, &behind.xy).map_err(|error| error.to_string())
+            }
+            None => {
+                Err("an epipolar mask needs planes at two depths: add a second [[batches.calibration]]"
+                    .into())
+            }
+        };
+        let confusion = Confusion::new(&Footprints::new(plane, OVERLAP_LEVEL)?);
         Ok(Self {
-            confusion: Confusion::new(&Footprints::new(plane, OVERLAP_LEVEL)?),
+            confusion: confusion.extended(&centroids, &places)?,
             coverage: coverage(&spreads),
             energies: column_energies(plane),
             centroids,
-            fundamental,
-            epipolar_px,
+            places,
+            extension,
+            epipolar,
             radius_px: spreads.radius_px(),
             not_unimodal,
             drifts,
@@ -149,7 +195,7 @@ impl Calibration {
         ];
         let mut metadata =
             about("where the dots land on the first calibration plane; -1: not seen", &["dot", "column"]);
-        if let Ok(fundamental) = &self.fundamental {
+        if let Ok(EpipolarFit { fundamental, .. }) = &self.epipolar {
             metadata.insert("fundamental".into(), json!(fundamental.rows()));
             metadata.insert("epipole".into(), json!(fundamental.epipole()));
         }
@@ -166,64 +212,4 @@ fn mean(batches: Vec<Centroids>) -> Centroids {
         *xy = (!seen.is_empty()).then(|| [of(0), of(1)]);
     }
     mean
-}
-
-/// The fundamental matrix from the positions of the dots on two planes. A dot's position on the first plane stands
-/// for its direction: the points along that direction project onto one line. So neither the mirror's angles nor its
-/// tracking accuracy need to be known.
-fn epipolar_geometry(
-    first: &Centroids,
-    second: Option<&Centroids>,
-) -> (std::result::Result<Fundamental, String>, Option<f64>) {
-    let Some(second) = second else {
-        return (
-            Err("an epipolar mask needs planes at two depths: add a second [[batches.calibration]]".into()),
-            None,
-        );
-    };
-    let both: Vec<([f64; 2], [f64; 2])> =
-        first.xy.iter().zip(&second.xy).filter_map(|(first, second)| Some(((*first)?, (*second)?))).collect();
-    let correspondences: Vec<Correspondence> = both
-        .iter()
-        .flat_map(|&(mirror, behind)| [mirror, behind].map(|camera| Correspondence { mirror, camera }))
-        .collect();
-    match Fundamental::from_correspondences(&correspondences) {
-        Ok(fundamental) => {
-            let square = |&(mirror, [x, y]): &([f64; 2], [f64; 2])| {
-                let [a, b, c] = fundamental.epipolar_line(mirror);
-                ((a * x + b * y + c) / a.hypot(b)).powi(2)
-            };
-            let rms_px = (both.iter().map(square).sum::<f64>() / both.len() as f64).sqrt();
-            (Ok(fundamental), Some(rms_px))
-        }
-        Err(error) => (Err(error.to_string()), None),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn two_planes_give_the_epipole_and_one_gives_a_reason() {
-        let shape = FrameShape::new(256, 256, 1).unwrap();
-        let batch = Batch::new(shape, raysweep_transport::dots::BatchArrays::default()).unwrap();
-        let footprints = Footprints::new(&batch, 0.5).unwrap();
-        let mut first = Centroids::new(&batch, &footprints).unwrap();
-        first.xy = (0..100)
-            .map(|dot| Some([20.0 + 20.0 * f64::from(dot % 10), 20.0 + 20.0 * f64::from(dot / 10)]))
-            .collect();
-        // Positions farther away move towards an epipole at (600, 90), by a share that depends on the position.
-        let mut second = first.clone();
-        for xy in second.xy.iter_mut().flatten() {
-            let share = 0.05 + 1e-4 * (xy[0] + 2.0 * xy[1]);
-            *xy = [xy[0] + share * (600.0 - xy[0]), xy[1] + share * (90.0 - xy[1])];
-        }
-        let (fundamental, rms_px) = epipolar_geometry(&first, Some(&second));
-        let [x, y, w] = fundamental.unwrap().epipole();
-        assert!((x / w - 600.0).abs() < 1.0 && (y / w - 90.0).abs() < 1.0, "{} {}", x / w, y / w);
-        assert!(rms_px.unwrap() < 1e-6);
-        assert!(epipolar_geometry(&first, None).0.is_err(), "one depth");
-        assert!(epipolar_geometry(&first, Some(&first)).0.is_err(), "the same depth twice");
-    }
 }

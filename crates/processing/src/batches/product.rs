@@ -312,7 +312,7 @@ impl DotSpec {
         match &self.kind {
             Kind::Floodlit => Ok(vec![scene.light.clone()]),
             Kind::Relight(Lighting { pattern, .. }) => {
-                let centroids = &calibrated()?.centroids;
+                let centroids = &calibrated()?.places;
                 let (image, images) = scene.image;
                 let drawn;
                 let pattern: ArrayView3<f32> = match patterns {
@@ -331,7 +331,7 @@ impl DotSpec {
                     Method::Neighbours => shadow_neighbours(batch, scene.light, &calibrated()?.confusion),
                     Method::Epipolar => {
                         let calibration = calibrated()?;
-                        let fundamental = calibration.fundamental.as_ref().map_err(Clone::clone)?;
+                        let fundamental = &calibration.epipolar.as_ref().map_err(Clone::clone)?.fundamental;
                         let rule = if options.printed { MaskRule::Printed } else { MaskRule::Plateau };
                         let Separation { distance_px, sigma_px, .. } = *options;
                         let measured_px = || {
@@ -342,7 +342,7 @@ impl DotSpec {
                         };
                         let distance_px = distance_px.map_or_else(measured_px, Ok)?;
                         let mask = EpipolarMask { distance_px, sigma_px, rule };
-                        epipolar(batch, scene.light, fundamental, &calibration.centroids.xy, &mask)
+                        epipolar(batch, scene.light, fundamental, &calibration.places.xy, &mask)
                     }
                 };
                 let separation = separation.map_err(told)?;

@@ -8,9 +8,11 @@ use raysweep_session::report::{
 };
 use raysweep_session::{Result, Session};
 
+use raysweep_transport::dots::calibrate::Extension;
+
 use super::calibration::Calibration;
 use super::task::DotTask;
-use crate::report::{accounts, subtitle};
+use crate::report::{accounts, page};
 
 /// Pictures of selected images of a video.
 pub(super) struct VideoStrip {
@@ -43,12 +45,12 @@ pub(super) fn make(
     sections.extend(strips.iter().map(video));
     sections.extend(calibration.map(|calibration| planes(calibration, task)));
     sections.push(trust(state, task));
-    Ok(Report {
-        title: state.session.name.clone(),
-        subtitle: subtitle(state, session),
-        facts: facts(state, task).into_iter().chain(flat_field(session, task)?).collect(),
+    Ok(page(
+        session,
+        state,
+        facts(state, task).into_iter().chain(flat_field(session, task)?).collect(),
         sections,
-    })
+    ))
 }
 
 fn facts(state: &State, task: &DotTask) -> Vec<(String, String)> {
@@ -109,13 +111,26 @@ fn planes(calibration: &Calibration, task: &DotTask) -> Section {
     {
         entries.push(("depth of a plane", format!("{}: {depth_mm} mm", plane + 1)));
     }
-    match (&calibration.fundamental, calibration.epipolar_px) {
-        (Ok(_), Some(px)) => {
-            entries.push(("the second plane's dots from their epipolar lines", format!("{px:.3} px rms")))
-        }
-        (Ok(_), None) => {}
-        (Err(why), _) => entries.push(("epipolar geometry", why.clone())),
-    }
+    entries.push(match &calibration.extension {
+        Ok(Extension { dots, sd_px }) => (
+            "dots beside the plane, placed by the mirror's path",
+            format!("{dots}; the others follow the path to {sd_px:.2} px"),
+        ),
+        Err(sd_px) => (
+            "dots beside the plane",
+            format!("not placed: the dots lie {sd_px:.1} px from where the mirror's path would have them"),
+        ),
+    });
+    entries.push(match &calibration.epipolar {
+        Ok(fit) => (
+            "the second plane's dots from their epipolar lines",
+            format!(
+                "{:.3} px (standard deviation), without {} outliers of {}; the planes are {:.1} px apart",
+                fit.sd_px, fit.outliers, fit.dots, fit.parallax_px
+            ),
+        ),
+        Err(why) => ("epipolar geometry", why.clone()),
+    });
     let rows = calibration.drifts.iter().map(|(batch, drift)| {
         vec![
             batch.to_string(),

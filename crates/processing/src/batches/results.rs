@@ -37,7 +37,7 @@ pub fn make(
 ) -> Result<Vec<String>> {
     let dots = session.dots()?;
     problems.extend(state.left_out());
-    let calibration = Calibration::of(&dots, task.shape, state, &mut problems);
+    let calibration = Calibration::of(&dots, task, state, &mut problems);
     if let Some(calibration) = &calibration {
         calibration.write(session)?;
     }

@@ -4,7 +4,9 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use raysweep_config::{BatchesPlan, ConfigError, DotRigFile, Places, Plan, StageTable};
-use raysweep_core::{CameraSettings, MirrorPath, PathError, PixelFormat, Shutter, decoding_message};
+use raysweep_core::{
+    CameraSettings, MechanicalDeg, MirrorPath, PathError, PixelFormat, Shutter, decoding_message,
+};
 use raysweep_pipeline::dots::{ColumnStage, DotScan, column_stage};
 use raysweep_session::pattern::PatternFile;
 use raysweep_session::stack::Contents;
@@ -38,6 +40,9 @@ pub struct DotTask {
     pub format: PixelFormat,
     /// The commanded mirror path of a batch.
     pub path: MirrorPath,
+    /// Direction of the beam in the middle of each frame's exposure, as tangents, if the mirror goes where the plan
+    /// wants it; `None` for frames that do not show the scene.
+    pub(super) directions: Vec<Option<[f64; 2]>>,
     /// Model that the path was predistorted with, if any.
     pub predistortion: Option<Predistortion>,
     /// The products to make.
@@ -94,6 +99,7 @@ impl DotTask {
         let broken = |error: PathError| refused(&["batches", "path"], format!("batches.path: {error}"));
         let limits = rig.limits();
         let wanted = batches.mirror_path(&limits).map_err(broken)?;
+        let directions = directions(&batches, &wanted, rig.incidence());
         let predistortion = Predistortion::of(rig, folder)?;
         let path = match &predistortion {
             Some(Predistortion { responses, .. }) => {
@@ -110,6 +116,7 @@ impl DotTask {
             shape,
             format,
             path,
+            directions,
             predistortion,
             specs,
             correct,
@@ -217,6 +224,20 @@ impl DotTask {
             self.refuse_stage(name, error.key().filter(is_in_plan).unwrap_or("name"), error.to_string())
         })
     }
+}
+
+/// Direction of the beam in the middle of each frame's exposure, which begins with the frame.
+fn directions(plan: &BatchesPlan, path: &MirrorPath, incidence: MechanicalDeg) -> Vec<Option<[f64; 2]>> {
+    let points = path.points();
+    let is_dark = |index: u32| index == plan.trailing_index() || plan.background_indices.contains(&index);
+    let middle = 0.5e-6 * plan.exposure_us * path.rate_hz();
+    let direction = |index: u32| {
+        let moment = f64::from(index) * points.len() as f64 / f64::from(plan.dots) + middle;
+        let (sample, share) = (moment as usize, moment.fract());
+        let [from, to] = [sample, sample + 1].map(|at| points[at % points.len()].tilt.beam(incidence));
+        [0, 1].map(|axis| from[axis] + share * (to[axis] - from[axis]))
+    };
+    (0..plan.dots).map(|index| (!is_dark(index)).then(|| direction(index))).collect()
 }
 
 /// What the pipeline extracts from the frames of one pass of `count` batches.

@@ -208,7 +208,11 @@ impl CalibrationArrays {
         Ok(npz.finish().map_err(|error| error.to_string())?.into_inner())
     }
 
-    fn from_bytes(bytes: &[u8]) -> Result<Self, ndarray_npy::ReadNpzError> {
+    /// Reads the content of `calibration.npz`.
+    ///
+    /// # Errors
+    /// When an array is missing or cannot be read.
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, ndarray_npy::ReadNpzError> {
         let mut npz = NpzReader::new(Cursor::new(bytes))?;
         let has_ambient = npz.names()?.iter().any(|name| name == AMBIENT);
         Ok(Self {

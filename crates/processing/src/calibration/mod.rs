@@ -16,9 +16,10 @@ use raysweep_transport::plane::board::Estimate;
 use raysweep_transport::plane::board::times::RowTimes;
 
 pub use self::file::{
-    CalibratedAmbient, CalibratedFlicker, CalibrationHeader, KeptCalibration, Pair, ValidFor, current_in,
+    CalibratedAmbient, CalibratedFlicker, CalibrationArrays, CalibrationHeader, KeptCalibration, Pair,
+    ValidFor, current_in,
 };
-use self::file::{CalibratedLight, CalibratedTiming, CalibrationArrays, SCHEMA};
+use self::file::{CalibratedLight, CalibratedTiming, SCHEMA};
 pub use self::images::{BoardImages, BoardPixels, CalibrationError};
 pub use self::task::{BoardPurpose, BoardView, CalibrationTask};
 use crate::plane::{KnownRig, manifest};

@@ -13,7 +13,7 @@ use raysweep_transport::plane::board::times::ExposureMode;
 use raysweep_transport::plane::{FIRST_RESPONSE_ROW, RESPONSE_ROWS};
 
 use super::{BoardFindings, CalibrationTask, KeptCalibration};
-use crate::report::{accounts, subtitle};
+use crate::report::{accounts, named, page};
 
 /// Number of pixels whose responses are shown of each part of the image.
 const SHOWN_PIXELS: usize = 60;
@@ -51,12 +51,7 @@ pub(super) fn make(
         ("camera", format!("{} × {} px", shape.columns, shape.rows)),
         ("frames lost", state.counts.lost_total().to_string()),
     ];
-    Report {
-        title: state.session.name.clone(),
-        subtitle: subtitle(state, session),
-        facts: facts.map(|(key, value)| (key.to_owned(), value)).to_vec(),
-        sections,
-    }
+    page(session, state, named(facts), sections)
 }
 
 fn section(title: &str, intro: &str, blocks: Vec<Block>) -> Section {

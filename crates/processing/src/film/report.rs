@@ -12,7 +12,7 @@ use raysweep_session::{Result, Session};
 use super::product::{FilmProducts, FilmVideo};
 use super::task::FilmTask;
 use crate::plane::report::{jitter, settings};
-use crate::report::{accounts, subtitle};
+use crate::report::{accounts, page};
 
 /// Cycles on the contact sheet.
 const SHOWN: usize = 8;
@@ -53,12 +53,7 @@ fn make(
     sections.extend(products.videos.iter().map(video));
     sections.push(pace(state));
     sections.push(trust(state, task));
-    Ok(Report {
-        title: state.session.name.clone(),
-        subtitle: subtitle(state, session),
-        facts: facts(state, task),
-        sections,
-    })
+    Ok(page(session, state, facts(state, task), sections))
 }
 
 /// The number of stored cycles that have no transport; those that were missing when the film ended may have been made

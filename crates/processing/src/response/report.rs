@@ -13,7 +13,7 @@ use serde_json::json;
 use super::analysis::FoundAxis;
 use super::task::{AXES, ResponseTask};
 use crate::mirror_response::AxisResponse;
-use crate::report::{accounts, subtitle};
+use crate::report::{accounts, named, page};
 
 /// Makes the report.
 pub fn make(session: &Session, state: &State, task: &ResponseTask, axes: &[FoundAxis; 2]) -> Report {
@@ -34,12 +34,7 @@ pub fn make(session: &Session, state: &State, task: &ResponseTask, axes: &[Found
             .into(),
         blocks: accounts(state),
     });
-    Report {
-        title: state.session.name.clone(),
-        subtitle: subtitle(state, session),
-        facts: facts.map(|(key, value)| (key.to_owned(), value)).to_vec(),
-        sections,
-    }
+    page(session, state, named(facts), sections)
 }
 
 fn section(state: &State, number: usize, (axis, name): (&FoundAxis, &str)) -> Section {

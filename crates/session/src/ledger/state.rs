@@ -87,11 +87,14 @@ impl State {
     /// Number of stored points of the plan, which are what [`Contents`] says.
     pub fn stored_points(&self) -> usize {
         match self.session.shape.contents {
-            Contents::Sweep { .. } | Contents::Board { .. } => self.stored(ArrayName::Sum).count(),
+            Contents::Sweep { .. } | Contents::Board { .. } | Contents::Patterns { .. } => {
+                self.stored(ArrayName::Sum).count()
+            }
             Contents::Film { .. } => self.cycles.len(),
             Contents::Batches { .. } => self.batches.len(),
             Contents::Axes { .. } => self.axes.len(),
             Contents::Darks { .. } => self.stored(ArrayName::Dark).count(),
+            Contents::Nothing => 0,
         }
     }
 

@@ -2,6 +2,9 @@ use super::*;
 use crate::stack::{ArrayName, Contents, StackShape};
 use raysweep_core::{Counts, LossCause};
 use std::fs;
+use std::process::Command;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
 
 fn session() -> SessionEntry {
     SessionEntry {
@@ -339,4 +342,22 @@ fn a_ledger_appears_with_its_first_lines_and_a_torn_first_one_says_what_it_was()
         let error = read(&path).unwrap_err();
         assert!(matches!(error, Error::Torn { .. }) && error.to_string().contains("trash"), "{error}");
     }
+}
+
+#[test]
+fn a_ledger_is_free_as_soon_as_it_is_dropped_although_processes_are_being_started() {
+    let (_dir, path) = ledger_with(&[point(0, 0)]);
+    let done = AtomicBool::new(false);
+    thread::scope(|scope| {
+        for _ in 0..2 {
+            scope.spawn(|| {
+                while !done.load(Ordering::Relaxed) {
+                    Command::new("true").status().unwrap();
+                }
+            });
+        }
+        let opened = (0..2_000).try_for_each(|_| Ledger::open(&path).map(drop));
+        done.store(true, Ordering::Relaxed);
+        opened.unwrap();
+    });
 }

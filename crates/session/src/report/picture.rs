@@ -118,6 +118,11 @@ impl Picture {
         Picture::new(image, tone_map, PICTURE_MAX_PX)
     }
 
+    /// A grey or colour picture of a linear image `[t, s, channels]` with one or three channels, with all of its pixels.
+    pub fn unreduced(image: ArrayView3<f32>, tone_map: ToneMap) -> Picture {
+        Picture::new(image, tone_map, usize::MAX)
+    }
+
     /// A grey picture for a contact sheet.
     pub fn thumbnail(image: ArrayView2<f32>, tone_map: ToneMap) -> Picture {
         Picture::new(image.insert_axis(Axis(2)), tone_map, THUMBNAIL_MAX_PX)

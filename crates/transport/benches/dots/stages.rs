@@ -201,7 +201,7 @@ pub fn of_columns(columns: &Columns) -> Result<Vec<Figure>, Box<dyn Error>> {
     let confusion = Confusion::new(&footprints);
     let centroids = Centroids::new(plane, &footprints)?;
     let energies = column_energies(plane);
-    let cover = coverage(&PointSpreads::new(plane)?);
+    let cover = coverage(&PointSpreads::new(plane, &centroids)?);
     let weights: Array2<f32> = pattern_weights(&centroids, pattern.view())?;
     let light = floodlit(batch);
     let arrays = batch.arrays();

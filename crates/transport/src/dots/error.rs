@@ -53,16 +53,16 @@ pub enum DotsError {
         /// The energy that is exceeded if there is a dot.
         needed: f64,
     },
-    /// Correspondences do not determine the fundamental matrix.
+    /// The planes do not determine the epipolar geometry.
     #[error(
-        "the correspondences lie on one plane (singular value ratio {ratio:.1e}, at least {needed:.1e} needed): \
-         scan the calibration plane at a second depth, or give mirror angles that were calibrated"
+        "the dots of the two calibration planes lie {parallax_px:.2} px apart, with a noise of {sd_px:.2} px: move the \
+         second plane to another depth"
     )]
     Planar {
-        /// The seventh singular value of the eight-point system over the largest.
-        ratio: f64,
-        /// Smallest accepted ratio.
-        needed: f64,
+        /// Median distance between a dot's places on the two planes, in pixels.
+        parallax_px: f64,
+        /// Standard deviation of the dots from their epipolar lines, in pixels.
+        sd_px: f64,
     },
 }
 

@@ -28,6 +28,7 @@ mod error;
 mod model;
 mod noise;
 mod products;
+pub mod separation;
 mod solve;
 
 pub use error::PlaneError;

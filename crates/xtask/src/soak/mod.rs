@@ -46,7 +46,15 @@ type Findings = Vec<String>;
 
 /// Soaks for `minutes`, and fails if anything was found.
 pub fn soak(minutes: f64) -> Done {
-    run(cargo().args(["build", "--package", "raysweep", "--bins", "--profile", "demo"]))?;
+    run(cargo().args([
+        "build",
+        "--package",
+        "raysweep",
+        "--bins",
+        "--profile",
+        "demo",
+        "--no-default-features",
+    ]))?;
     let folder = target().join("soak");
     let _ = std::fs::remove_dir_all(&folder);
     let soak = Soak::new(target().join("demo"), folder)?;

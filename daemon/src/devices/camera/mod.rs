@@ -64,8 +64,13 @@ pub struct Pass {
 pub enum Work {
     /// Measure the settings latency, by changing from and to these settings.
     Probe(CameraSettings),
-    /// Points, each until all its frames have arrived.
+    /// Points, each until all its frames have arrived, and until all are decided.
     Pass(Pass),
+    /// Points, each until all its frames have arrived. They are decided while more work is done, the last of which is
+    /// [`Work::Settle`].
+    PassOn(Pass),
+    /// Wait until all points are decided.
+    Settle,
     /// A film.
     Film(FilmPass),
 }
@@ -86,6 +91,8 @@ const MARGIN_FRAMES: u32 = 6;
 enum Ended {
     /// All of its points are decided, or will be: the pipeline has received the flush.
     Flushed(Result<(), DeviceError>),
+    /// More work decides the points.
+    Done(Result<(), DeviceError>),
     /// The pipeline accepts nothing any more.
     NotFlushed,
 }
@@ -169,14 +176,14 @@ impl CameraThread {
     }
 
     /// Does some work and waits until it ends. The verdicts on its points, followed by that on the flush, arrive at
-    /// the pipeline's sink, even if the camera failed (the inner error).
+    /// the pipeline's sink, even if the camera failed (the inner error); those of [`Work::PassOn`] after later work.
     ///
     /// # Errors
     /// [`Gone`] if there will be no verdicts.
     pub fn acquire(&self, work: Work) -> Result<Result<(), DeviceError>, Gone> {
         self.work.send(work).map_err(|_closed| Gone)?;
         match self.ended.recv() {
-            Ok(Ended::Flushed(acquired)) => Ok(acquired),
+            Ok(Ended::Flushed(acquired) | Ended::Done(acquired)) => Ok(acquired),
             Ok(Ended::NotFlushed) | Err(_) => Err(Gone),
         }
     }
@@ -218,6 +225,8 @@ struct Acquisition {
     told_seq: Option<u64>,
     /// Number of settings written only to lead in to others.
     lead_ins: u32,
+    /// Whether the camera still has the settings of the work before, from which the next ones can be told apart.
+    is_led_in: bool,
     exposures: Exposures,
 }
 
@@ -258,11 +267,12 @@ impl Acquisition {
             line,
             told_seq: None,
             lead_ins: 0,
+            is_led_in: false,
             exposures: Exposures::default(),
         }
     }
 
-    /// Always ends with a flush, so that every point is decided.
+    /// Ends with a flush, so that every point is decided, unless more work is sure to follow.
     fn work(&mut self, work: Work, latency: &OnceLock<SettingsLatency>) -> Ended {
         // Frames since the last work do not count: an operator may have taken minutes to change the projected image.
         self.told_seq = None;
@@ -272,7 +282,13 @@ impl Acquisition {
                     latency.get_or_init(|| found);
                 }
             }),
-            Work::Pass(pass) => self.sweep(pass),
+            Work::Pass(pass) => self.sweep(pass).and_then(|()| self.settle()),
+            Work::PassOn(pass) => {
+                let swept = self.sweep(pass);
+                self.is_led_in = swept.is_ok();
+                return Ended::Done(swept);
+            }
+            Work::Settle => self.settle(),
             Work::Film(film) => self.film(&film),
         };
         match self.input.send(DeviceEvent::Flush) {

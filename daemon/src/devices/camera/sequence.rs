@@ -74,7 +74,7 @@ impl FilmPass {
 }
 
 impl Acquisition {
-    /// Takes points in order. Each ends in a unit or a failure.
+    /// Takes points in order. Each ends in a unit or a failure, at the latest once the camera has settled.
     pub(super) fn sweep(&mut self, pass: Pass) -> Result<(), DeviceError> {
         self.warm_up(pass.not_before_ns)?;
         let slot = |attempt| SequenceSlot { attempt, periods_from_last: None, place: 0, may_hold: true };
@@ -87,14 +87,15 @@ impl Acquisition {
         self.warm_up(film.not_before_ns)?;
         let mut slots = film.slots().peekable();
         self.take_by_sets(film, &mut slots)?;
-        self.sequence(slots)
+        self.sequence(slots)?;
+        self.settle()
     }
 
     fn sequence(&mut self, slots: impl Iterator<Item = SequenceSlot>) -> Result<(), DeviceError> {
         let mut slots = slots.peekable();
         let mut watchdog = Watchdog::default();
         // Start with settings that belong to no point, so that a point's frames do not depend on what came before.
-        let mut is_led_in = false;
+        let mut is_led_in = std::mem::take(&mut self.is_led_in);
         let mut runs_on = false;
         while self.orders.go_on() {
             let order = self.orders.now();
@@ -139,11 +140,11 @@ impl Acquisition {
                 None => watchdog.missed(timeout, self.longest_frame_us, self.camera.state())?,
             }
         }
-        self.settle()
+        Ok(())
     }
 
     /// Skips frames until all points are decided.
-    fn settle(&mut self) -> Result<(), DeviceError> {
+    pub(super) fn settle(&mut self) -> Result<(), DeviceError> {
         if self.pace == Pace::Pipeline {
             // Always the same number, so that runs are bit-identical.
             return self.pass_frames(MARGIN_FRAMES, i64::MIN);

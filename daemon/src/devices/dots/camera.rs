@@ -81,14 +81,18 @@ impl Source<'_> {
         let mut rest_frames = 0;
         loop {
             let before = wanted();
-            rest_frames += u32::from(before == NextWanted::Rest);
             if before == NextWanted::Nothing || rest_frames > MOST_REST_FRAMES {
                 return Ok(lost);
             }
             let free = match self.pace {
-                Pace::Pipeline => Some(self.pool.take()),
+                // Orders are obeyed during a long wait, too.
+                Pace::Pipeline => match self.pool.take_within(POLL) {
+                    None => continue,
+                    free => free,
+                },
                 Pace::Devices => self.pool.try_take(),
             };
+            rest_frames += u32::from(before == NextWanted::Rest);
             let has_room = free.is_some();
             let mut data = match free {
                 Some(data) => data,

@@ -12,7 +12,7 @@ const FEWEST_WAITING: usize = 24;
 const STANDSTILL_S: f64 = 0.2;
 /// Upper limit of memory for queued frames.
 const MOST_WAITING_BYTES: usize = 1 << 30;
-/// Buffers for frames in the workers, and for those of the beam dump that wait for their index.
+/// Buffers for frames in the workers.
 pub const FRAMES_AT_WORK: usize = 40;
 
 /// Queue length for frames between the camera and the workers.

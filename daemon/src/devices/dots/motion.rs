@@ -35,7 +35,7 @@ impl Motion {
         let wanted_hz = path.rate_hz();
         if (rate_hz - wanted_hz).abs() > RATE_TOLERANCE * wanted_hz {
             let what = format!(
-                "the controller plays {rate_hz} samples per second, but the plan's rate_hz (in [batches.path] or [response]) is {wanted_hz}: set it to the controller's rate"
+                "the controller plays {rate_hz} samples per second, but the plan's rate_hz (in [batches.path], [response] or [viewfinder]) is {wanted_hz}: set it to the controller's rate"
             );
             return Err(DeviceError::new("mirror", DeviceErrorKind::OutOfRange, what));
         }

@@ -14,11 +14,12 @@ use raysweep_session::dots::RawFrames;
 use raysweep_session::ledger::Ledger;
 use raysweep_transport::dots::{DotsError, FlatField};
 
+use super::frame_buffers;
 use super::sink::{BatchSink, RawSink, StoredBatches, Writing};
 use crate::devices::dots::camera::FrameRefused;
+use crate::devices::dots::frames_waiting;
 use crate::devices::dots::motion::Motion;
 use crate::devices::dots::play::Player;
-use crate::devices::dots::{FRAMES_AT_WORK, frames_waiting};
 use crate::probes::Probes;
 use crate::rig::{DotDevices, DotRig, Pace};
 use crate::run::error::RunError;
@@ -87,7 +88,7 @@ pub fn acquire(
             board: &run.board,
             motion: &mut motion,
             camera: &mut *camera,
-            pool: FramePool::new(waiting + FRAMES_AT_WORK, frame_bytes),
+            pool: FramePool::new(frame_buffers(task, pace), frame_bytes),
             stand,
             clock,
             pace,

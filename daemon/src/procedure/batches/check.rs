@@ -5,7 +5,7 @@ use raysweep_processing::batches::DotTask;
 use raysweep_proto::{BatchesCheck, CheckReport};
 use raysweep_transport::dots::Correction;
 
-use crate::devices::dots::{FRAMES_AT_WORK, frames_waiting};
+use super::frame_buffers;
 use crate::procedure::lab::Lab;
 use crate::rig::Pace;
 
@@ -36,7 +36,6 @@ pub fn check(task: &DotTask, lab: &Lab<'_>, pace: Pace) -> Result<CheckReport, C
     let batch_s = plan.path.duration_s();
     let dots = u64::from(plan.dots);
     let frame_bytes = task.format.frame_bytes(task.shape.pixels()) as u64;
-    let frames = frames_waiting(pace, plan.camera_rate_hz(), frame_bytes as usize) + FRAMES_AT_WORK;
     let residual_bytes = 4 * task.shape.blocks() as u64;
     let batch_bytes = dots * (COLUMN_BYTES.min(5 * task.shape.pixels() as u64) + residual_bytes);
     let total = plan.total() as u64;
@@ -52,7 +51,7 @@ pub fn check(task: &DotTask, lab: &Lab<'_>, pace: Pace) -> Result<CheckReport, C
         );
     }
     let room = lab.room(
-        frames as u64 * frame_bytes
+        frame_buffers(task, pace) as u64 * frame_bytes
             + BATCHES_IN_MEMORY * batch_bytes
             + 16 * image_bytes
             + task.products_bytes()?,

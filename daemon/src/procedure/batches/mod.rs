@@ -14,9 +14,10 @@ use raysweep_session::ledger::{EndEntry, EndState, Entry};
 use raysweep_session::stack::StackShape;
 
 use self::acquire::{Acquired, acquire};
+use crate::devices::dots::{FRAMES_AT_WORK, frames_waiting};
 use crate::probes::Probes;
 use crate::procedure::lab::Lab;
-use crate::rig::DotRig;
+use crate::rig::{DotRig, Pace};
 use crate::run::error::RunError;
 use crate::run::life::{Ended, Foreseen, Measurement, Run, end_entry, end_state};
 
@@ -52,6 +53,13 @@ pub fn foresee(
             probes: lab.probes.clone(),
         }),
     })
+}
+
+/// Buffers for the frames that are on their way from the camera to a batch.
+fn frame_buffers(task: &DotTask, pace: Pace) -> usize {
+    let frame_bytes = task.format.frame_bytes(task.shape.pixels());
+    let waiting = frames_waiting(pace, task.batches.camera_rate_hz(), frame_bytes);
+    waiting + FRAMES_AT_WORK + task.scan(task.batches.count).frames_kept()
 }
 
 impl Measurement for BatchesRun {

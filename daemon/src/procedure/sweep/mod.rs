@@ -11,17 +11,17 @@ use raysweep_core::{CameraCapabilities, Pattern, SettingsId, SettingsLatency, Vs
 use raysweep_pipeline::PointRole;
 use raysweep_processing::calibration::KeptCalibration;
 use raysweep_processing::memory::{MemoryNeed, available_bytes};
-use raysweep_processing::plane::{PlaneTask, Processing, manifest};
+use raysweep_processing::plane::{Processing, manifest};
 use raysweep_processing::sweep::{Overview, Results, SweepTask, write_products, write_report};
 use raysweep_proto::{CheckReport, DesignParams, DesignReport, RpcError};
 use raysweep_session::Session;
-use raysweep_session::ledger::{EndEntry, EndState, Entry, Ledger, State};
-use raysweep_session::stack::{ArrayName, StackShape};
+use raysweep_session::ledger::{EndEntry, EndState, Entry, Ledger};
+use raysweep_session::stack::StackShape;
 
 use crate::devices::camera::Exposures;
 use crate::live::{LiveEstimate, Outlet};
 use crate::plane::advice::{advise, design};
-use crate::plane::{Opened, Passes, PointSink, Taken, missing};
+use crate::plane::{Opened, Passes, PointSink, Taken, missing, regular_again};
 use crate::procedure::lab::{Lab, RigOfRun, keep_calibration};
 use crate::rig::Rig;
 use crate::run::error::RunError;
@@ -192,17 +192,6 @@ fn acquire_points(
         }
         _ => Ok(()),
     }
-}
-
-/// The regular image, if it is stored and lit points are missing: a resumed run takes it again before them, only to see
-/// whether there is light, because they may be points that see none.
-fn regular_again(task: &PlaneTask, missing: &[SettingsId], state: &State) -> Option<SettingsId> {
-    let points = &task.schedule.points;
-    let regular = points.iter().position(|point| point.role == PointRole::Regular)? as u32;
-    let is_lit = |id: &SettingsId| !matches!(points[id.point as usize].role, PointRole::Dark(_));
-    let is_missing = missing.iter().any(|id| id.point == regular);
-    let attempt = state.next_attempt(ArrayName::Regular, 0);
-    (!is_missing && missing.iter().any(is_lit)).then_some(SettingsId { point: regular, attempt })
 }
 
 /// Starts the running estimate; the run works without it too.

@@ -7,6 +7,7 @@
 
 mod chunks;
 mod driver;
+mod facts;
 mod features;
 mod file;
 mod frames;
@@ -21,6 +22,8 @@ mod settings;
 mod setup;
 
 pub use driver::{AravisCamera, RigFacts};
+pub use facts::{CameraFacts, facts};
 pub use file::{RefusedLine, load_features, save_features};
 pub use library::{FoundCamera, discover};
+pub use network::SocketBuffer;
 pub use raysweep_config::rig::aravis::{AravisConfig, SensorRegion, TimestampAt};

@@ -37,18 +37,26 @@ impl SocketBuffer {
         }
     }
 
+    /// Whether the system allows what is wanted.
     pub fn suffices(&self) -> bool {
         self.wanted_bytes <= self.allowed_bytes
     }
 
-    /// What is wrong and how to fix it, if the allowed size is too small.
-    pub fn warning(&self) -> Option<String> {
+    /// What is wrong, if the allowed size is too small, and how to fix it.
+    pub fn shortage(&self) -> Option<(String, String)> {
         let Self { wanted_bytes, allowed_bytes } = self;
         (!self.suffices()).then(|| {
-            format!(
-                "net.core.rmem_max = {allowed_bytes} allows no socket buffer of {wanted_bytes} bytes for this camera's frames: packets will be lost whenever the host is busy. Mend it with `sysctl -w net.core.rmem_max={wanted_bytes}`; a file in /etc/sysctl.d keeps it"
-            )
+            let what = format!(
+                "net.core.rmem_max = {allowed_bytes} allows no socket buffer of {wanted_bytes} bytes for this camera's frames: packets will be lost whenever the host is busy"
+            );
+            let remedy = format!("`sysctl -w net.core.rmem_max={wanted_bytes}`; a file in /etc/sysctl.d keeps it");
+            (what, remedy)
         })
+    }
+
+    /// Both in one line.
+    pub fn warning(&self) -> Option<String> {
+        self.shortage().map(|(what, remedy)| format!("{what}. Mend it with {remedy}"))
     }
 }
 

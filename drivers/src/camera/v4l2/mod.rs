@@ -10,6 +10,8 @@ mod formats;
 mod kernel;
 mod node;
 mod open_node;
+#[cfg(feature = "v4l2")]
+mod search;
 mod setup;
 mod timing;
 
@@ -27,6 +29,8 @@ use raysweep_core::{
 pub use self::formats::fourcc;
 pub use self::node::{ControlKind, Filled, Format, Identity, Node, NodeControl, NodeOpener};
 use self::open_node::{Layout, OpenNode};
+#[cfg(feature = "v4l2")]
+pub use self::search::{FoundNode, nodes};
 pub use self::setup::V4l2Setup;
 use self::timing::{ExposureTimes, Ids, exposure_start_ns, is_monotonic};
 use crate::reopen::Reopening;

@@ -9,7 +9,7 @@ pub mod protocol;
 mod stream;
 
 use std::ops::RangeInclusive;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 pub use raysweep_config::rig::dots::PlayzerXLink;
@@ -257,6 +257,11 @@ impl Drop for PlayzerX {
             tracing::error!(%error, "the mirror could not be parked");
         }
     }
+}
+
+/// Asks the controller at this port what it is.
+pub(super) fn greet(port: &Path) -> Result<String, DeviceError> {
+    hello(&mut Port::open(DEVICE, port, BAUD)?)
 }
 
 /// Completes a frame that a cut-off write may have left on the wire, and asks for the controller's description.

@@ -19,7 +19,7 @@ use self::clock::SampleClock;
 use self::protocol::SampleRate;
 use self::scan::Scanner;
 use super::DEVICE;
-pub use usb::Usb;
+pub use usb::{Usb, has_firmware};
 
 /// Without a sample for so long the analyser has stopped.
 const STALL: Duration = Duration::from_millis(1000);

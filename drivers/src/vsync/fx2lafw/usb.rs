@@ -17,6 +17,12 @@ use crate::vsync::DEVICE;
 const READY: (u16, u16) = (0x1D50, 0x608C);
 /// Vendor and product ids of the chip and of clones without the firmware.
 const BLANK: [(u16, u16); 3] = [(0x0925, 0x3881), (0x04B4, 0x8613), (0x08A9, 0x0014)];
+/// Whether the analyser with these ids has its firmware; `None` for other devices.
+pub fn has_firmware(vendor: u16, product: u16) -> Option<bool> {
+    let is_blank = BLANK.contains(&(vendor, product));
+    ((vendor, product) == READY || is_blank).then_some(!is_blank)
+}
+
 /// Maximum time for an analyser to reappear with its firmware.
 const RENUMERATION: Duration = Duration::from_secs(3);
 const CONTROL: Duration = Duration::from_millis(500);

@@ -7,6 +7,7 @@
 
 pub mod protocol;
 
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 pub use raysweep_config::rig::vsync::{TriggerBoxConfig, TriggerBoxLink};
@@ -47,6 +48,29 @@ fn bytes_ns(link: TriggerBoxLink, bytes: usize) -> i64 {
         TriggerBoxLink::Uart => bytes as i64 * 10 * 1_000_000_000 / i64::from(BAUD),
         TriggerBoxLink::Usb => 0,
     }
+}
+
+/// Asks the box at a serial port for its firmware's version; `None` if no box answers. Its pulses stay as they are.
+pub fn firmware(port: &Path) -> Option<u8> {
+    let mut port = Port::open(DEVICE, port, BAUD).ok()?;
+    let deadline = Instant::now() + HELLO_PATIENCE;
+    let question = TriggerBoxCommand::Version.to_bytes();
+    // The firmware reads pairs of bytes: what others have asked before may have left it with half a pair.
+    let after_half_a_pair = [b"?", question.as_slice()].concat();
+    for question in [&question, &after_half_a_pair].into_iter().cycle() {
+        if Instant::now() > deadline {
+            break;
+        }
+        port.send(question).ok()?;
+        let version = port.await_reply(HELLO_EVERY, parse_reply, |reply| match reply {
+            TriggerBoxReply::Version(version) => Some(version),
+            TriggerBoxReply::Time { .. } => None,
+        });
+        if let Some(version) = version.ok()? {
+            return Some(version);
+        }
+    }
+    None
 }
 
 /// Why a box cannot be used, or cannot be used any longer.

@@ -34,6 +34,14 @@ pub enum DotSceneError {
         /// What is required.
         expected: String,
     },
+    /// Planes from files do not fit a built-in scene.
+    #[error(
+        "plane_files goes with a scene from a file, not with the built-in scene \"{name}\": leave it out, and use plane_depths"
+    )]
+    PlanesOfFiles {
+        /// The scene.
+        name: &'static str,
+    },
     /// Light is negative or not finite.
     #[error(
         "scene file {}: T[{dot}] holds {value} (value {index} of its image): light must be finite and not negative",

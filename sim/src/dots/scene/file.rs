@@ -1,21 +1,22 @@
 //! Scenes from files: one image for each of N dots.
 //!
-//! `.npz`: `T` float32 (or float64, converted) `[N, H, W]` or `[N, H, W, 3]`, and `uv` `[N, 2]`, the dots' centres in
+//! `.npz`: `T` `[N, H, W]` or `[N, H, W, 3]` of 16, 32 or 64 bit floats, and `uv` `[N, 2]`, the dots' centres in
 //! the field of view, 0..1 from left to right and from top to bottom. `.npy`: `T` alone, with dots on a square grid,
 //! row by row from the top. Images are interpolated between dots.
 
 use std::fs::File;
 use std::io::BufReader;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use ndarray::{Array2, ArrayD, Axis, Ix2, IxDyn, OwnedRepr};
-use ndarray_npy::{NpzReader, ReadNpyError, ReadNpyExt, ReadNpzError};
+use ndarray_npy::{NpzReader, ReadNpyExt};
 use raysweep_core::Mosaic;
 
 use super::error::DotSceneError;
 use super::still::{Still, seen};
 use crate::dots::beam::BeamSpot;
 use crate::dots::view::CameraView;
+use crate::stored_float::StoredFloat;
 
 /// Number of surrounding dots that are interpolated if the dots do not form a grid.
 const NEIGHBOURS: usize = 4;
@@ -33,30 +34,50 @@ pub struct FileScene {
 impl FileScene {
     /// Loads a scene from a file.
     pub fn load(path: &Path, half: [f64; 2], mosaic: Mosaic) -> Result<Self, DotSceneError> {
-        let unreadable = |reason: String| DotSceneError::Unreadable { path: path.into(), reason };
-        let file = || File::open(path).map(BufReader::new).map_err(|error| unreadable(error.to_string()));
-        let (transport, uv) = if path.extension().is_some_and(|extension| extension == "npy") {
-            let transport = match ArrayD::<f32>::read_npy(file()?) {
-                Err(ReadNpyError::WrongDescriptor(_)) => {
-                    ArrayD::<f64>::read_npy(file()?).map(|wide| wide.mapv(|value| value as f32))
+        let mut arrays = Arrays::open(path)?;
+        let (transport, uv) = match &arrays {
+            Arrays::One(_) => (arrays.read("T")?, None),
+            Arrays::Named { names, .. } => {
+                if !["T", "uv"].iter().all(|wanted| names.iter().any(|name| name == wanted)) {
+                    return Err(DotSceneError::Layout {
+                        path: path.into(),
+                        found: format!("it holds [{}]", names.join(", ")),
+                        expected: "T [N, H, W] or [N, H, W, 3] and uv [N, 2]".into(),
+                    });
                 }
-                read => read,
-            };
-            (transport.map_err(|error| unreadable(error.to_string()))?, None)
-        } else {
-            let mut npz = NpzReader::new(file()?).map_err(|error| unreadable(error.to_string()))?;
-            let names = npz.names().map_err(|error| unreadable(error.to_string()))?;
-            if !["T", "uv"].iter().all(|wanted| names.iter().any(|name| name == wanted)) {
-                return Err(DotSceneError::Layout {
-                    path: path.into(),
-                    found: format!("it holds [{}]", names.join(", ")),
-                    expected: "T [N, H, W] or [N, H, W, 3] and uv [N, 2]".into(),
-                });
+                (arrays.read("T")?, Some(arrays.read("uv")?))
             }
-            let mut read = |name| array(&mut npz, name).map_err(|error| unreadable(error.to_string()));
-            (read("T")?, Some(read("uv")?))
         };
         Self::new(path, transport, uv, half, mosaic)
+    }
+
+    /// Loads planes under the dots of this scene from a file: each array of images in it is one, in their order.
+    pub fn load_planes(&self, path: &Path, mosaic: Mosaic) -> Result<Vec<Self>, DotSceneError> {
+        let mut arrays = Arrays::open(path)?;
+        let names = match &arrays {
+            Arrays::One(_) => vec!["T".to_owned()],
+            Arrays::Named { names, .. } => names.clone(),
+        };
+        let uv = Array2::from_shape_fn((self.uv.len(), 2), |(dot, axis)| self.uv[dot][axis] as f32);
+        let (rows, columns) = self.size();
+        let expected = || format!("[{}, {rows}, {columns}], as the scene's dots and images", self.uv.len());
+        let mut planes = Vec::new();
+        for name in &names {
+            let images = arrays.read(name)?;
+            // Centres, radii and the like.
+            if images.ndim() < 3 {
+                continue;
+            }
+            if images.shape().get(..3) != Some(&[self.uv.len(), rows, columns]) {
+                return Err(DotSceneError::Layout {
+                    path: path.into(),
+                    found: format!("{name} has the shape {:?}", images.shape()),
+                    expected: expected(),
+                });
+            }
+            planes.push(Self::new(path, images, Some(uv.clone().into_dyn()), self.view.half, mosaic)?);
+        }
+        Ok(planes)
     }
 
     fn new(
@@ -200,12 +221,43 @@ fn grid_of(uv: &[[f64; 2]]) -> Option<[usize; 2]> {
     on_grid.then_some(counts)
 }
 
-/// Reads a float32 array, or a float64 array with conversion.
-fn array(npz: &mut NpzReader<BufReader<File>>, name: &str) -> Result<ArrayD<f32>, ReadNpzError> {
-    match npz.by_name::<OwnedRepr<f32>, IxDyn>(name) {
-        Err(ReadNpzError::Npy(ReadNpyError::WrongDescriptor(_))) => {
-            Ok(npz.by_name::<OwnedRepr<f64>, IxDyn>(name)?.mapv(|value| value as f32))
+/// The arrays of a file.
+enum Arrays {
+    /// An `.npy`.
+    One(PathBuf),
+    /// An `.npz`.
+    Named { path: PathBuf, npz: Box<NpzReader<BufReader<File>>>, names: Vec<String> },
+}
+
+impl Arrays {
+    fn open(path: &Path) -> Result<Self, DotSceneError> {
+        if path.extension().is_some_and(|extension| extension == "npy") {
+            return Ok(Self::One(path.into()));
         }
-        other => other,
+        let mut npz = NpzReader::new(reader(path)?).map_err(|error| unreadable(path, error))?;
+        let names = npz.names().map_err(|error| unreadable(path, error))?;
+        Ok(Self::Named { path: path.into(), npz: Box::new(npz), names })
     }
+
+    /// Reads an array of floats; 16 and 64 bit floats are converted. The name does not matter to an `.npy`.
+    fn read(&mut self, name: &str) -> Result<ArrayD<f32>, DotSceneError> {
+        let floats = |values: ArrayD<StoredFloat>| values.map(|StoredFloat(value)| *value);
+        match self {
+            Self::One(path) => {
+                ArrayD::read_npy(reader(path)?).map(floats).map_err(|error| unreadable(path, error))
+            }
+            Self::Named { path, npz, .. } => npz
+                .by_name::<OwnedRepr<StoredFloat>, IxDyn>(name)
+                .map(floats)
+                .map_err(|error| unreadable(path, error)),
+        }
+    }
+}
+
+fn reader(path: &Path) -> Result<BufReader<File>, DotSceneError> {
+    File::open(path).map(BufReader::new).map_err(|error| unreadable(path, error))
+}
+
+fn unreadable(path: &Path, reason: impl std::fmt::Display) -> DotSceneError {
+    DotSceneError::Unreadable { path: path.into(), reason: reason.to_string() }
 }

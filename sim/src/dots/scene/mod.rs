@@ -44,24 +44,38 @@ impl DotScene {
         folder: &Path,
     ) -> Result<Self, DotSceneError> {
         let extension = config.scene.extension().and_then(|extension| extension.to_str());
-        let (kind, size): (Kind, _) = if let Some("npz" | "npy") = extension {
+        let traced = |view| {
+            let planes = config.plane_depths.iter().map(move |&depth| {
+                Arc::new(Surface::trace(SceneModel::plane(depth), view, mosaic)) as Arc<dyn Still>
+            });
+            planes.collect::<Vec<_>>()
+        };
+        let (kind, planes, size): (Kind, _, _) = if let Some("npz" | "npy") = extension {
             let scene = FileScene::load(&folder.join(&config.scene), half, mosaic)?;
             let size = scene.size();
-            (Kind::File(Arc::new(scene)), size)
+            let mut planes: Vec<Arc<dyn Still>> = Vec::new();
+            for file in &config.plane_files {
+                for plane in scene.load_planes(&folder.join(file), mosaic)? {
+                    planes.push(Arc::new(plane));
+                }
+            }
+            if planes.is_empty() {
+                planes = traced(CameraView { size, half });
+            }
+            (Kind::File(Arc::new(scene)), planes, size)
         } else {
             let name = config.scene.to_string_lossy();
-            let name = BUILTIN_NAMES.into_iter().find(|known| *known == name);
-            let name = name.ok_or_else(|| DotSceneError::UnknownName {
-                name: config.scene.to_string_lossy().into_owned(),
-            })?;
-            (Kind::Builtin(name), (config.rows, config.columns))
+            let builtin = BUILTIN_NAMES.into_iter().find(|known| *known == name);
+            let Some(builtin) = builtin else {
+                return Err(DotSceneError::UnknownName { name: name.into_owned() });
+            };
+            if !config.plane_files.is_empty() {
+                return Err(DotSceneError::PlanesOfFiles { name: builtin });
+            }
+            let size = (config.rows, config.columns);
+            (Kind::Builtin(builtin), traced(CameraView { size, half }), size)
         };
         let view = CameraView { size, half };
-        let planes = config
-            .plane_depths
-            .iter()
-            .map(|&depth| Arc::new(Surface::trace(SceneModel::plane(depth), view, mosaic)) as Arc<dyn Still>)
-            .collect();
         Ok(Self { kind, planes, view, mosaic, seed: config.seed })
     }
 

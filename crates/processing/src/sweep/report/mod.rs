@@ -18,7 +18,7 @@ use super::strips::Overview;
 use super::task::SweepTask;
 use crate::plane::place;
 use crate::plane::report::{jitter, settings};
-use crate::report::{accounts, subtitle};
+use crate::report::{accounts, page};
 
 /// The same for the stack's indirect light, which is far dimmer and fills more of its images.
 const INDIRECT_PERCENTILE: f64 = 70.0;
@@ -68,12 +68,7 @@ fn make(
     sections.push(sweep.contact_sheet()?);
     sections.extend(summary.iter().map(|summary| findings::section(&summary.findings)));
     sections.push(trust(state, task, summary.as_ref()));
-    Ok(Report {
-        title: state.session.name.clone(),
-        subtitle: subtitle(state, session),
-        facts: facts(state, task),
-        sections,
-    })
+    Ok(page(session, state, facts(state, task), sections))
 }
 
 fn facts(state: &State, task: &SweepTask) -> Vec<(String, String)> {

@@ -7,6 +7,10 @@ use crate::dots::sensor::median;
 use crate::dots::shape::BLOCK_PX;
 use crate::dots::{Batch, DotsError, FrameShape};
 
+/// A dot with less than this share of the median dot's light missed the plane, or most of it: what is seen is noise, or
+/// an edge whose middle is not the dot's.
+const LEAST_LIGHT: f64 = 0.25;
+
 /// The positions of the dots on the calibration plane.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Centroids {
@@ -29,7 +33,13 @@ pub struct Drift {
 }
 
 impl Centroids {
-    /// Means of the pixel positions within the footprints, weighted by light.
+    /// Positions that are known otherwise, `[dots]`.
+    pub fn at(shape: FrameShape, xy: Vec<Option<[f64; 2]>>) -> Self {
+        Self { shape, xy }
+    }
+
+    /// Means of the pixel positions within the footprints, weighted by light. Dots with less than a quarter of the
+    /// median dot's light are not seen.
     ///
     /// # Errors
     /// [`DotsError::Shape`] if the footprints belong to another batch.
@@ -50,9 +60,14 @@ impl Centroids {
                     }
                 }
             }
-            (light > 0.0).then(|| [x / light, y / light])
+            (light, [x / light, y / light])
         };
-        Ok(Self { shape, xy: (0..batch.dots()).map(centroid).collect() })
+        let found: Vec<(f64, [f64; 2])> = (0..batch.dots()).map(centroid).collect();
+        let mut lights: Vec<f64> =
+            found.iter().map(|(light, _)| *light).filter(|light| *light > 0.0).collect();
+        let least = if lights.is_empty() { 0.0 } else { LEAST_LIGHT * median(&mut lights) };
+        let xy = found.into_iter().map(|(light, xy)| (light > 0.0 && light >= least).then_some(xy));
+        Ok(Self { shape, xy: xy.collect() })
     }
 
     /// Shape of the frames.

@@ -1,6 +1,9 @@
 use rayon::prelude::*;
 
-use super::Footprints;
+use super::{Centroids, Footprints};
+use crate::dots::DotsError;
+use crate::dots::error::check_shape;
+use crate::dots::sensor::median;
 
 /// The number of pixels that each pair of dots shares: the calibration confusion matrix M, symmetric, with the dots'
 /// areas on its diagonal. Only nonzero entries are stored, as compressed sparse rows in the layout of
@@ -38,6 +41,10 @@ impl Confusion {
                 },
             )
             .collect();
+        Self::of_rows(rows)
+    }
+
+    fn of_rows(rows: Vec<Vec<(u32, u32)>>) -> Self {
         let mut confusion = Self { offsets: vec![0], ..Self::default() };
         for row in rows {
             confusion.neighbours.extend(row.iter().map(|(other, _)| other));
@@ -45,6 +52,46 @@ impl Confusion {
             confusion.offsets.push(confusion.neighbours.len() as u64);
         }
         confusion
+    }
+
+    /// The same with neighbours for the dots that the plane does not show, but whose places are known: each shares one
+    /// pixel with itself and with all dots as near as the farthest neighbour of a seen dot is in the median. Unchanged
+    /// if no dot has a neighbour.
+    ///
+    /// # Errors
+    /// [`DotsError::Shape`] if the numbers of dots differ.
+    pub fn extended(&self, seen: &Centroids, places: &Centroids) -> Result<Self, DotsError> {
+        let dots = self.dots();
+        check_shape("seen", "[dots]", &[seen.xy.len()], &[dots])?;
+        check_shape("places", "[dots]", &[places.xy.len()], &[dots])?;
+        let distance = |one: usize, other: usize| {
+            let (one, other) = (places.xy[one]?, places.xy[other]?);
+            Some((one[0] - other[0]).hypot(one[1] - other[1]))
+        };
+        let farthest = |dot: usize| {
+            let neighbours = self.neighbours(dot).iter().filter(|other| seen.xy[**other as usize].is_some());
+            neighbours.filter_map(|other| distance(dot, *other as usize)).fold(0.0, f64::max)
+        };
+        let seen_dots = (0..dots).filter(|dot| seen.xy[*dot].is_some());
+        let mut reaches: Vec<f64> = seen_dots.map(farthest).filter(|reach| *reach > 0.0).collect();
+        if reaches.is_empty() {
+            return Ok(self.clone());
+        }
+        let reach = median(&mut reaches);
+        let unseen: Vec<usize> = (0..dots).filter(|dot| seen.xy[*dot].is_none()).collect();
+        let all: Vec<usize> = (0..dots).collect();
+        let rows = (0..dots).into_par_iter().map(|dot| {
+            let met = self.neighbours(dot).iter().map(|&other| (other, self.overlap_px(dot, other as usize)));
+            let candidates = if seen.xy[dot].is_none() { &all } else { &unseen };
+            let near = candidates.iter().filter(|other| {
+                distance(dot, **other).is_some_and(|distance| distance <= reach)
+                    && self.overlap_px(dot, **other) == 0
+            });
+            let mut row: Vec<(u32, u32)> = met.chain(near.map(|other| (*other as u32, 1))).collect();
+            row.sort_unstable();
+            row
+        });
+        Ok(Self::of_rows(rows.collect()))
     }
 
     /// Number of dots.

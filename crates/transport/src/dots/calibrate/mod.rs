@@ -5,11 +5,14 @@ mod centroid;
 mod confusion;
 mod footprint;
 mod fundamental;
+mod places;
+mod robust;
 mod spread;
 
 pub use centroid::{Centroids, Drift};
 pub use confusion::Confusion;
 pub use footprint::Footprints;
 pub(crate) use footprint::luminance;
-pub use fundamental::{Correspondence, Fundamental, LEAST_RATIO, mirror_plane};
+pub use fundamental::{EpipolarFit, Fundamental, LEAST_PARALLAX};
+pub use places::Extension;
 pub use spread::PointSpreads;

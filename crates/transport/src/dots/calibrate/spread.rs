@@ -3,7 +3,9 @@ use std::f64::consts::PI;
 
 use rayon::prelude::*;
 
+use super::Centroids;
 use super::footprint::luminance;
+use crate::dots::error::check_shape;
 use crate::dots::sensor::median;
 use crate::dots::shape::BLOCK_PX;
 use crate::dots::{Batch, BatchArrays, DotsError, FrameShape, SparseColumn};
@@ -20,6 +22,9 @@ const LEVELS: [f32; 3] = [0.25, 0.5, 0.75];
 /// Share of a piece's pixels that may lie outside it, because of noise.
 const CRUMBS: f64 = 0.05;
 
+/// A dot whose peak differs by more than this from what its light suggests lies partly beside the plane.
+const PEAK_TOLERANCE: f32 = 0.2;
+
 /// The spread of each dot's light over the pixels, with peak 1: columns of one channel without residual.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PointSpreads {
@@ -31,16 +36,26 @@ pub struct PointSpreads {
 
 impl PointSpreads {
     /// From the discs around the brightest pixel of each dot's column: the measured values where all contours are one
-    /// piece, otherwise 1 down to half of the peak. The peak is that of the mean of 3 x 3 pixels, to reduce noise.
+    /// piece, otherwise 1 down to half of the peak. The peak is that of the mean of 3 x 3 pixels or, with less noise,
+    /// the dot's light times the median ratio of peak to light. Dots without a centroid have no spread.
     ///
     /// # Errors
-    /// [`DotsError::Damaged`] if there are more pixels than a batch can contain.
-    pub fn new(batch: &Batch) -> Result<Self, DotsError> {
+    /// [`DotsError::Shape`] if the centroids belong to another batch, [`DotsError::Damaged`] if there are more pixels
+    /// than a batch can contain.
+    pub fn new(batch: &Batch, centroids: &Centroids) -> Result<Self, DotsError> {
+        check_shape("centroids", "[dots]", &[centroids.xy.len()], &[batch.dots()])?;
         let shape = FrameShape::new(batch.shape().height(), batch.shape().width(), 1)?;
-        let spreads: Vec<(SparseColumn, bool)> = (0..batch.dots())
+        let mut spreads: Vec<(SparseColumn, bool)> = (0..batch.dots())
             .into_par_iter()
-            .map_init(|| Plane::new(shape), |plane, dot| plane.spread(batch, dot))
+            .map_init(
+                || Plane::new(shape),
+                |plane, dot| match centroids.xy[dot] {
+                    Some(_) => plane.spread(batch, dot),
+                    None => (plane.none(), false),
+                },
+            )
             .collect();
+        even_peaks(&mut spreads);
         let mut arrays = BatchArrays::default();
         spreads.iter().for_each(|(column, _)| arrays.push(column));
         let unimodal = spreads.iter().map(|(_, unimodal)| *unimodal).collect();
@@ -54,6 +69,23 @@ impl PointSpreads {
         let mut radii: Vec<f64> =
             own.map(|dot| (self.columns.column(dot).pixels().count() as f64 / PI).sqrt()).collect();
         (!radii.is_empty()).then(|| median(&mut radii))
+    }
+}
+
+/// Scales the spreads of whole dots, each in units of its own peak, to the peak that its light suggests.
+fn even_peaks(spreads: &mut [(SparseColumn, bool)]) {
+    let light = |column: &SparseColumn| column.values.iter().sum::<f32>();
+    let own = || spreads.iter().filter(|(_, unimodal)| *unimodal);
+    let mut lights: Vec<f64> = own().map(|(column, _)| f64::from(light(column))).collect();
+    if lights.is_empty() {
+        return;
+    }
+    let usual = median(&mut lights) as f32;
+    for (column, _) in spreads.iter_mut().filter(|(_, unimodal)| *unimodal) {
+        let scale = usual / light(column);
+        if (scale - 1.0).abs() <= PEAK_TOLERANCE {
+            column.values.iter_mut().for_each(|value| *value *= scale);
+        }
     }
 }
 
@@ -72,6 +104,11 @@ impl Plane {
         Self { shape, light: vec![0.0; pixels], smooth: vec![f32::NAN; pixels], seen: vec![false; pixels] }
     }
 
+    /// No light.
+    fn none(&self) -> SparseColumn {
+        SparseColumn { residual: vec![0.0; self.shape.blocks()], ..SparseColumn::default() }
+    }
+
     fn spread(&mut self, batch: &Batch, dot: usize) -> (SparseColumn, bool) {
         let column = batch.column(dot);
         column.pixels().for_each(|(pixel, value)| self.light[pixel] = luminance(value));
@@ -81,7 +118,7 @@ impl Plane {
         }
         let brightest = pixels.iter().copied().max_by(|&a, &b| self.smooth[a].total_cmp(&self.smooth[b]));
         let peak = brightest.map_or(0.0, |pixel| self.smooth[pixel]);
-        let mut spread = SparseColumn { residual: vec![0.0; self.shape.blocks()], ..SparseColumn::default() };
+        let mut spread = self.none();
         let mut unimodal = false;
         if let Some(brightest) = brightest.filter(|_| peak > 0.0) {
             let disc = self.piece(brightest, f32::NEG_INFINITY);

@@ -1,11 +1,15 @@
 //! Exports sessions for use elsewhere.
 
+mod formats;
+mod mat;
+
 use std::path::{Path, PathBuf};
 
 use raysweep_session::Session;
 use raysweep_session::integrity::Audit;
 use raysweep_session::ledger::LedgerText;
 
+pub use self::formats::{ExportFormat, export_as};
 use crate::stored::ProcessError;
 
 /// What is copied of a session.
@@ -24,13 +28,7 @@ pub enum ExportScope {
 pub fn export(dir: &Path, to: &Path, accept_damage: bool, scope: ExportScope) -> Result<usize, ProcessError> {
     let session = Session::open(dir)?;
     if !accept_damage {
-        let text = LedgerText::read(&session.ledger_path())?;
-        let state = text.replay(&session.ledger_path())?;
-        let Audit { damage, .. } = Audit::without_data(&session, &text, &state)?;
-        if !damage.is_empty() {
-            let damage = damage.iter().map(ToString::to_string).collect();
-            return Err(ProcessError::DamagedResults { dir: dir.to_owned(), damage });
-        }
+        check_sound(&session)?;
     }
     create_new(to)?;
     let mut files =
@@ -57,6 +55,18 @@ pub fn export(dir: &Path, to: &Path, accept_damage: bool, scope: ExportScope) ->
         }
     }
     Ok(copied)
+}
+
+/// Checks that no result of a session is damaged.
+fn check_sound(session: &Session) -> Result<(), ProcessError> {
+    let text = LedgerText::read(&session.ledger_path())?;
+    let state = text.replay(&session.ledger_path())?;
+    let Audit { damage, .. } = Audit::without_data(session, &text, &state)?;
+    if damage.is_empty() {
+        return Ok(());
+    }
+    let damage = damage.iter().map(ToString::to_string).collect();
+    Err(ProcessError::DamagedResults { dir: session.dir().to_owned(), damage })
 }
 
 /// Puts what was acquired of a session into the new folder `to`, which must not exist, so that it can be processed there

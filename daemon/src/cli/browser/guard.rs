@@ -1,0 +1,95 @@
+//! Who may use the page: whoever knows the token in its address, from a page of this address alone.
+
+use std::sync::Arc;
+
+use axum::extract::{Request, State};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
+use axum::middleware::Next;
+use axum::response::{IntoResponse, Response};
+
+/// Scripts, styles and data come from this address, and nothing frames the page.
+const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; \
+                      connect-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'";
+
+/// Reports have their styles and pictures inside them, and never a script.
+pub(super) const OF_REPORTS: (HeaderName, &str) = (
+    header::CONTENT_SECURITY_POLICY,
+    "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'; sandbox",
+);
+
+pub(super) struct Guard {
+    pub token: String,
+    pub port: u16,
+}
+
+impl Guard {
+    /// Why a request is refused; `None` if it is not.
+    fn refusal(&self, path: &str, headers: &HeaderMap) -> Option<&'static str> {
+        let host = headers.get(header::HOST).and_then(|host| host.to_str().ok()).unwrap_or_default();
+        let hosts = ["127.0.0.1", "localhost"].map(|name| format!("{name}:{}", self.port));
+        // A name that another server resolves to this machine (DNS rebinding) is not this address.
+        if !hosts.iter().any(|known| known == host) {
+            return Some("open the page at the address that `raysweep view` printed");
+        }
+        let token = path.trim_start_matches('/').split('/').next().unwrap_or_default();
+        if !is_equal(token.as_bytes(), self.token.as_bytes()) {
+            return Some("the address lacks the token that `raysweep view` printed");
+        }
+        let is_foreign = headers.get(header::ORIGIN).is_some_and(|origin| {
+            !hosts.iter().any(|host| origin.as_bytes() == format!("http://{host}").as_bytes())
+        });
+        is_foreign.then_some("pages of other addresses may not use this one")
+    }
+}
+
+/// Compares in a time that does not depend on where they differ.
+fn is_equal(one: &[u8], other: &[u8]) -> bool {
+    one.len() == other.len() && one.iter().zip(other).fold(0, |differs, (a, b)| differs | (a ^ b)) == 0
+}
+
+/// Lets a request through, or refuses it.
+pub(super) async fn admit(State(guard): State<Arc<Guard>>, request: Request, next: Next) -> Response {
+    let mut answer = match guard.refusal(request.uri().path(), request.headers()) {
+        Some(why) => (StatusCode::FORBIDDEN, why).into_response(),
+        None => next.run(request).await,
+    };
+    let headers = answer.headers_mut();
+    headers.entry(header::CONTENT_SECURITY_POLICY).or_insert(HeaderValue::from_static(POLICY));
+    headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
+    headers.insert(header::REFERRER_POLICY, HeaderValue::from_static("no-referrer"));
+    headers.insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
+    answer
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_this_address_with_its_token_and_its_own_pages_are_let_in() {
+        let guard = Guard { token: "0123abcd".into(), port: 8000 };
+        let refusal = |path: &str, host: &str, origin: Option<&str>| {
+            let mut headers = HeaderMap::new();
+            headers.insert(header::HOST, host.parse().unwrap());
+            if let Some(origin) = origin {
+                headers.insert(header::ORIGIN, origin.parse().unwrap());
+            }
+            guard.refusal(path, &headers)
+        };
+        assert_eq!(refusal("/0123abcd/", "127.0.0.1:8000", None), None);
+        assert_eq!(refusal("/0123abcd/call", "localhost:8000", Some("http://localhost:8000")), None);
+        for (path, host, origin) in [
+            ("/", "127.0.0.1:8000", None),
+            ("/0123abce/", "127.0.0.1:8000", None),
+            ("/0123abcd0/", "127.0.0.1:8000", None),
+            ("/0123abcd/", "127.0.0.1:8001", None),
+            ("/0123abcd/", "rig.example.org:8000", None),
+            ("/0123abcd/", "", None),
+            ("/0123abcd/call", "127.0.0.1:8000", Some("http://example.org")),
+            ("/0123abcd/call", "127.0.0.1:8000", Some("null")),
+            ("/0123abcd/call", "127.0.0.1:8000", Some("https://127.0.0.1:8000")),
+        ] {
+            assert!(refusal(path, host, origin).is_some(), "{path} {host} {origin:?}");
+        }
+    }
+}

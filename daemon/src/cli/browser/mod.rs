@@ -1,0 +1,253 @@
+//! `raysweep view`: a page in the browser that shows what the rig does and what it did.
+//!
+//! The view is a client like any other: it asks the daemon through its socket, with the rights of the user who started
+//! it, and reads the live file and the sessions as that user. Nothing here runs in the daemon. Data flow one way, from
+//! the [`hub`] that follows the daemon to any number of browsers; only `call` goes back.
+
+mod guard;
+mod hub;
+mod pictures;
+mod stored;
+
+use std::fs::File;
+use std::io::{self, Read};
+use std::net::{Ipv4Addr, SocketAddr};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use axum::body::Bytes;
+use axum::extract::{DefaultBodyLimit, Path as Segment, Query, State};
+use axum::http::{StatusCode, header};
+use axum::response::sse::{KeepAlive, Sse};
+use axum::response::{IntoResponse, Response};
+use axum::routing::{get, post};
+use axum::{Json, Router, middleware};
+use raysweep_proto::{Client, ClientError, ErrorCode, Method, RpcError};
+use serde::Deserialize;
+use serde_json::{Map, Value, json};
+use tokio::net::TcpListener;
+use tokio::sync::Semaphore;
+use tokio::task::spawn_blocking;
+
+use self::guard::Guard;
+use self::hub::Hub;
+use super::exit::Exit;
+use super::failure::CommandFailure;
+use super::printer::Printer;
+use super::show;
+
+/// Calls that all browsers together may have with the daemon at once: it gives one user few connections.
+const CALLS_AT_ONCE: usize = 4;
+/// Largest message of a browser: as large as the socket takes.
+const MESSAGE_BYTES: usize = 1 << 20;
+
+/// What the page may call: what it has buttons for.
+const CALLS: [Method; 9] = [
+    Method::Status,
+    Method::Check,
+    Method::Run,
+    Method::Resume,
+    Method::Pause,
+    Method::Continue,
+    Method::Cancel,
+    Method::Viewfinder,
+    Method::Sessions,
+];
+
+/// The files of the page, with their types.
+const FILES: [(&str, &str, &[u8]); 9] = [
+    ("", "text/html; charset=utf-8", include_bytes!("page/index.html")),
+    ("style.css", "text/css; charset=utf-8", include_bytes!("page/style.css")),
+    ("main.js", "text/javascript; charset=utf-8", include_bytes!("page/main.js")),
+    ("picture.js", "text/javascript; charset=utf-8", include_bytes!("page/picture.js")),
+    ("run.js", "text/javascript; charset=utf-8", include_bytes!("page/run.js")),
+    ("finder.js", "text/javascript; charset=utf-8", include_bytes!("page/finder.js")),
+    ("sessions.js", "text/javascript; charset=utf-8", include_bytes!("page/sessions.js")),
+    ("uplot.js", "text/javascript; charset=utf-8", include_bytes!("page/uplot.js")),
+    ("uplot.css", "text/css; charset=utf-8", include_bytes!("page/uplot.css")),
+];
+
+/// What the handlers share.
+struct View {
+    socket: PathBuf,
+    hub: Hub,
+    turns: Semaphore,
+}
+
+/// Serves the page on 127.0.0.1 until Ctrl-C; prints its address first. Port 0: any free one.
+pub(super) fn view(socket: &Path, port: u16, printer: Printer) -> Result<Exit, CommandFailure> {
+    let token = token().map_err(CommandFailure::View)?;
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
+    let runtime = runtime.map_err(CommandFailure::View)?;
+    let served = runtime.block_on(async {
+        let listener = TcpListener::bind(SocketAddr::from((Ipv4Addr::LOCALHOST, port)));
+        let listener = listener.await.map_err(CommandFailure::View)?;
+        let port = listener.local_addr().map_err(CommandFailure::View)?.port();
+        let hub = Hub::start(socket).map_err(CommandFailure::View)?;
+        let view = Arc::new(View { socket: socket.to_owned(), hub, turns: Semaphore::new(CALLS_AT_ONCE) });
+        let address = format!("http://127.0.0.1:{port}/{token}/");
+        printer
+            .print(&json!({ "address": address }), |_| format!("open {address} in a browser; Ctrl-C ends"))?;
+        let app = routes(view, Guard { token, port });
+        let ended = async {
+            // Without a handler of signals, the process ends as it would anyway.
+            let _ = tokio::signal::ctrl_c().await;
+        };
+        // Streams of events never end, so connections are not waited for.
+        tokio::select! {
+            served = axum::serve(listener, app) => served.map_err(CommandFailure::View),
+            () = ended => Ok(()),
+        }
+    });
+    // Reads that are still under way are not waited for.
+    runtime.shutdown_background();
+    served.map(|()| Exit::Done)
+}
+
+fn routes(view: Arc<View>, guard: Guard) -> Router {
+    let mut pages = Router::new();
+    for (name, kind, content) in FILES {
+        let answer = move || async move { ([(header::CONTENT_TYPE, kind)], content) };
+        pages = pages.route(&format!("/{{token}}/{name}"), get(answer));
+    }
+    pages
+        .route("/{token}/call", post(call))
+        .route("/{token}/events", get(events))
+        .route("/{token}/live", get(live))
+        .route("/{token}/live/{name}", get(live_picture))
+        .route("/{token}/session/{session}", get(session))
+        .route("/{token}/session/{session}/report", get(report))
+        .route("/{token}/session/{session}/picture/{product}", get(product))
+        .route("/{token}/session/{session}/pixel/{row}/{column}", get(pixel))
+        .layer(DefaultBodyLimit::max(MESSAGE_BYTES))
+        .layer(middleware::from_fn_with_state(Arc::new(guard), guard::admit))
+        .with_state(view)
+}
+
+/// 128 random bits, in hexadecimal digits.
+fn token() -> io::Result<String> {
+    let mut bytes = [0; 16];
+    File::open("/dev/urandom")?.read_exact(&mut bytes)?;
+    Ok(bytes.iter().map(|byte| format!("{byte:02x}")).collect())
+}
+
+/// A call of the page.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Call {
+    method: String,
+    #[serde(default)]
+    params: Map<String, Value>,
+}
+
+/// Carries out a call of the daemon: `{"result": ...}` or `{"error": {"code": ..., "message": ...}}`.
+async fn call(State(view): State<Arc<View>>, body: Bytes) -> Response {
+    let call: Call = match serde_json::from_slice(&body) {
+        Ok(call) => call,
+        Err(error) => return refused(StatusCode::BAD_REQUEST, &format!("not a call: {error}")),
+    };
+    let Some(method) = CALLS.into_iter().find(|method| method.name() == call.method) else {
+        return refused(StatusCode::FORBIDDEN, &format!("the page may not call `{}`", call.method));
+    };
+    let _turn = view.turns.acquire().await;
+    let socket = view.socket.clone();
+    let answer = spawn_blocking(move || {
+        let result: Value = Client::connect(&socket)?.call(method, &call.params)?;
+        Ok::<_, ClientError>(result)
+    });
+    match answer.await {
+        Ok(Ok(result)) => {
+            let text = serde_json::from_value(result.clone()).ok().filter(|_| method == Method::Check);
+            Json(json!({ "result": result, "text": text.map(|report| show::check(&report)) })).into_response()
+        }
+        Ok(Err(ClientError::Rpc(error))) => Json(json!({ "error": error })).into_response(),
+        Ok(Err(error)) => Json(json!({ "error": { "message": error.to_string() } })).into_response(),
+        Err(_) => {
+            Json(json!({ "error": RpcError::new(ErrorCode::Internal, "the call failed") })).into_response()
+        }
+    }
+}
+
+/// The daemon's events, and `{"event": "connection"}` when the daemon is lost and found.
+async fn events(State(view): State<Arc<View>>) -> impl IntoResponse {
+    Sse::new(view.hub.follow()).keep_alive(KeepAlive::default())
+}
+
+/// Names of the live images, with the sequence number of the newest of each.
+async fn live(State(view): State<Arc<View>>) -> Response {
+    let file = view.hub.live_file();
+    read(move || pictures::names(file.as_deref()).map(|names| Json(names).into_response())).await
+}
+
+#[derive(Deserialize)]
+struct Newer {
+    /// Only a picture with a larger sequence number is wanted.
+    #[serde(default)]
+    after: u64,
+}
+
+/// The newest picture of a name; "no content" if none came within a while.
+async fn live_picture(
+    State(view): State<Arc<View>>,
+    Segment((_, name)): Segment<(String, String)>,
+    Query(Newer { after }): Query<Newer>,
+) -> Response {
+    for _ in 0..pictures::LOOKS {
+        let (file, name) = (view.hub.live_file(), name.clone());
+        let answer = read(move || {
+            let newest = pictures::newest(file.as_deref(), &name, after)?;
+            Ok(newest.map_or(StatusCode::NO_CONTENT.into_response(), IntoResponse::into_response))
+        });
+        let answer = answer.await;
+        if answer.status() != StatusCode::NO_CONTENT {
+            return answer;
+        }
+        tokio::time::sleep(pictures::PACE).await;
+    }
+    StatusCode::NO_CONTENT.into_response()
+}
+
+/// A session as `raysweep show` shows it, with the names of its pictures.
+async fn session(
+    State(view): State<Arc<View>>,
+    Segment((_, session)): Segment<(String, String)>,
+) -> Response {
+    read(move || Ok(Json(stored::session(&view.hub.session(&session)?)?).into_response())).await
+}
+
+/// The report, which contains its pictures and no script.
+async fn report(State(view): State<Arc<View>>, Segment((_, session)): Segment<(String, String)>) -> Response {
+    read(move || {
+        let page = stored::report(&view.hub.session(&session)?)?;
+        Ok(([(header::CONTENT_TYPE, "text/html; charset=utf-8"), guard::OF_REPORTS], page).into_response())
+    })
+    .await
+}
+
+async fn product(
+    State(view): State<Arc<View>>,
+    Segment((_, session, product)): Segment<(String, String, String)>,
+) -> Response {
+    read(move || Ok(stored::picture(&view.hub.session(&session)?, &product)?.into_response())).await
+}
+
+/// Light from each projector row to a pixel.
+async fn pixel(
+    State(view): State<Arc<View>>,
+    Segment((_, session, row, column)): Segment<(String, String, usize, usize)>,
+) -> Response {
+    read(move || Ok(Json(stored::pixel(&view.hub.session(&session)?, row, column)?).into_response())).await
+}
+
+/// Reads files without holding up other requests; an error becomes a text.
+async fn read(reading: impl FnOnce() -> Result<Response, String> + Send + 'static) -> Response {
+    match spawn_blocking(reading).await {
+        Ok(Ok(answer)) => answer,
+        Ok(Err(why)) => refused(StatusCode::NOT_FOUND, &why),
+        Err(_) => refused(StatusCode::INTERNAL_SERVER_ERROR, "reading failed"),
+    }
+}
+
+fn refused(status: StatusCode, why: &str) -> Response {
+    (status, why.to_owned()).into_response()
+}

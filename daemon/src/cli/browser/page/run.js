@@ -1,0 +1,204 @@
+// The view of the run: state, figures, question, VSYNC, plan and live pictures.
+
+import { by, call, note } from "./main.js";
+import { hearFinder, showFinder, startFinder } from "./finder.js";
+import { Picture, element, fetchPicture, number } from "./picture.js";
+
+const UNDER_WAY = ["preparing", "armed", "running", "paused", "draining"];
+
+const clock = (seconds) => {
+  if (!Number.isFinite(seconds)) return "unknown";
+  const whole = Math.round(seconds);
+  const two = (part) => String(part).padStart(2, "0");
+  return `${two(Math.floor(whole / 3600))}:${two(Math.floor(whole / 60) % 60)}:${two(whole % 60)}`;
+};
+const words = (name) => name.replaceAll("_", " ");
+const nameOf = (folder) => folder?.split("/").pop();
+
+let status = {};
+/** Jitter since the page was opened: seconds, standard deviation, 99th percentile. */
+const jitter = [[], [], []];
+let plot = null;
+const opened = performance.now();
+
+export function startRun() {
+  for (const [id, method] of [["pause", "pause"], ["continue", "continue"], ["answer", "continue"], ["cancel", "cancel"]]) {
+    by(id).addEventListener("click", async () => {
+      by(id).disabled = true;
+      complain(await call(method));
+      refresh();
+    });
+  }
+  by("plan-file").addEventListener("change", async (event) => {
+    const [file] = event.target.files;
+    if (file) by("plan").value = await file.text();
+  });
+  by("check").addEventListener("click", check);
+  by("start").addEventListener("click", start);
+  window.addEventListener("resize", () => plot?.setSize({ width: by("vsync").clientWidth, height: 150 }));
+  startFinder({ complain, refresh });
+  watchPictures();
+  setInterval(() => { if (!document.hidden) refresh(); }, 2000);
+  return hear;
+}
+
+function hear(event) {
+  switch (event.event) {
+    case "connection":
+      by("lost").hidden = !event.lost;
+      by("lost").textContent = event.lost ? `${event.lost}. The page goes on when the daemon is back.` : "";
+      if (event.lost) { status = {}; draw(); } else refresh();
+      break;
+    case "progress": status.progress = event; draw(); break;
+    case "vsync": addJitter(event); break;
+    case "viewfinder": hearFinder(event); break;
+    case "state": status.state = event.state; draw(); refresh(); break;
+    case "ask": status.question = event.text; draw(); refresh(); break;
+    case "finished": refresh(); break;
+  }
+}
+
+async function refresh() {
+  const { result } = await call("status");
+  if (!result) return;
+  status = result;
+  if (result.vsync) tellVsync(result.vsync);
+  showFinder(UNDER_WAY.includes(result.state) ? result.viewfinder : null);
+  draw();
+}
+
+function complain({ error }) {
+  if (error) by("notes").replaceChildren(note("bad", error.message));
+}
+
+function draw() {
+  const { state, progress, session, question, role } = status;
+  const isUnderWay = UNDER_WAY.includes(state);
+  const observes = role === "observer";
+  by("daemon").textContent = status.rig ? `${status.rig} rig` : "";
+  by("state").textContent = state ? words(state) : "not connected";
+  by("state").dataset.state = state ?? "lost";
+  document.title = isUnderWay && progress ? `${progress.points_stored}/${progress.points_planned} – raysweep` : "raysweep";
+  for (const part of document.querySelectorAll(".operator")) part.hidden = observes;
+  by("observer").hidden = !observes;
+  by("question").hidden = !question;
+  by("question-text").textContent = question ?? "";
+  by("answer").disabled = !question;
+  by("run-name").textContent = session ? nameOf(session) : "No run yet";
+  by("pause").disabled = !["armed", "running"].includes(state);
+  by("continue").disabled = state !== "paused";
+  by("cancel").disabled = !isUnderWay;
+  by("start").disabled = by("check").disabled = isUnderWay || !state;
+  by("progress").max = progress?.points_planned || 1;
+  by("progress").value = progress?.points_stored ?? 0;
+  const rows = [];
+  if (progress) {
+    const lost = Object.entries(progress.counts.lost).map(([cause, frames]) => `${frames} ${words(cause)}`);
+    rows.push(["stored", `${progress.points_stored} of ${progress.points_planned}`]);
+    if (isUnderWay) rows.push(["time left", clock(progress.left_s ?? NaN)]);
+    rows.push(["elapsed", clock(progress.elapsed_s)], ["rate", `${number(progress.frames_per_s)} frames/s`],
+      ["frames used", `${progress.counts.averaged} of ${progress.counts.expected}`], ["lost", lost.join(", ") || "none"]);
+  }
+  if (status.mirror) rows.push(["mirror", `${status.mirror.parked ? "parked" : "not parked"}, laser ${status.mirror.laser ? "on" : "off"}`]);
+  by("figures").replaceChildren(...rows.flatMap(([key, value]) => [element("dt", {}, key), element("dd", {}, value)]));
+  const notes = [];
+  if (status.ended) notes.push(note(status.ended === "complete" ? "good" : "warn", `The run is ${status.ended}.`));
+  if (status.error) notes.push(note("bad", status.error));
+  notes.push(...(status.warnings ?? []).map((warning) => note("warn", warning)));
+  if (status.ended && session) {
+    notes.push(element("p", {}, element("a", { href: `session/${encodeURIComponent(nameOf(session))}/report`, target: "_blank", rel: "noopener" }, "Open the report")));
+  }
+  by("notes").replaceChildren(...notes);
+}
+
+function tellVsync(vsync) {
+  by("vsync-card").hidden = false;
+  by("vsync-text").textContent = `period ${vsync.period_us.toFixed(2)} µs, jitter ${number(vsync.jitter_us)} µs; `
+    + `${vsync.edges} edges, ${vsync.missed} missed, ${vsync.false_edges} false`;
+}
+
+function addJitter(vsync) {
+  tellVsync(vsync);
+  const row = [(performance.now() - opened) / 1000, vsync.jitter_us, vsync.jitter_p99_us];
+  row.forEach((value, axis) => jitter[axis].push(value));
+  if (jitter[0].length > 3600) jitter.forEach((values) => values.shift());
+  plot ??= new uPlot({
+    width: by("vsync").clientWidth, height: 150, scales: { x: { time: false } }, legend: { show: false },
+    axes: [{ label: "time since the page was opened, s", labelSize: 20, stroke: axisColour, grid: { stroke: gridColour } },
+      { label: "µs", labelSize: 18, size: 44, stroke: axisColour, grid: { stroke: gridColour } }],
+    series: [{}, { label: "standard deviation", stroke: axisColour, width: 2, points: { show: true, size: 4 } },
+      { label: "99 %", stroke: axisColour, width: 1, dash: [4, 3], points: { show: false } }],
+  }, jitter, by("vsync"));
+  plot.setData(jitter);
+}
+export const axisColour = () => (matchMedia("(prefers-color-scheme: dark)").matches ? "#9aa4b0" : "#5a6470");
+export const gridColour = () => (matchMedia("(prefers-color-scheme: dark)").matches ? "#343a42" : "#e3e6ea");
+
+async function check() {
+  by("checked").hidden = false;
+  by("checked").className = "checked";
+  by("checked").textContent = "checking …";
+  const { error, text } = await call("check", { plan: by("plan").value });
+  by("checked").className = error ? "checked bad" : "checked";
+  by("checked").textContent = error ? mistakes(error) : text;
+}
+
+const mistakes = (error) => (error.data?.mistakes ?? []).map((mistake) => mistake.message).join("\n") || error.message;
+
+async function start() {
+  by("start").disabled = true;
+  const { error } = await call("run", { plan: by("plan").value });
+  by("checked").hidden = !error;
+  by("checked").className = "checked bad";
+  by("checked").textContent = error ? mistakes(error) : "";
+  refresh();
+}
+
+/** Shows the newest live picture of the chosen name, as soon as it comes. */
+async function watchPictures() {
+  let [names, chosen, sequence] = [{}, null, 0];
+  const picture = new Picture(by("live-picture"), { label: "Live picture" });
+  picture.element.hidden = true;
+  const wait = (seconds) => new Promise((done) => { setTimeout(done, 1000 * seconds); });
+  const choose = (name) => {
+    [chosen, sequence] = [name, 0];
+    for (const button of by("live-names").children) button.setAttribute("aria-pressed", String(button.textContent === name));
+  };
+  const look = async () => {
+    const answer = await fetch("live");
+    const found = answer.ok ? await answer.json() : {};
+    if (Object.keys(found).join() === Object.keys(names).join()) return;
+    names = found;
+    by("live-names").replaceChildren(...Object.keys(names).map((name) =>
+      element("button", { type: "button", "aria-pressed": "false", onclick: () => choose(name) }, name)));
+    if (!(chosen in names)) choose(Object.keys(names)[0] ?? null);
+    else choose(chosen);
+  };
+  for (;;) {
+    try {
+      await look();
+      const newest = chosen && !document.hidden ? await fetchPicture(`live/${encodeURIComponent(chosen)}?after=${sequence}`) : null;
+      if (newest && newest.name === chosen) {
+        sequence = newest.sequence;
+        picture.element.hidden = false;
+        by("live-none").hidden = true;
+        picture.show(newest);
+        by("live-about").textContent = describe(newest);
+      } else if (!newest) {
+        await wait(chosen && !document.hidden ? 0.05 : 1);
+      }
+    } catch {
+      await wait(1);
+    }
+  }
+}
+
+function describe({ about, shape }) {
+  const parts = [`${shape[1]} × ${shape[0]} px`];
+  if (about.points != null) parts.push(`from ${about.points} points`);
+  if (about.cycle != null) parts.push(`cycle ${about.cycle}`);
+  if (about.batch != null) parts.push(`batch ${about.batch}`);
+  if (about.units) parts.push(about.units);
+  if (about.session) parts.push(nameOf(about.session));
+  return parts.join(" · ");
+}

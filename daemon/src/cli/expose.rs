@@ -1,0 +1,383 @@
+//! `raysweep expose`: tries exposures on the scene with a viewfinder, and proposes a plan.
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use raysweep_config::plan::{Axis, with_tables};
+use raysweep_config::{Plan, Procedure};
+use raysweep_proto::{
+    CheckReport, Client, ClientError, ErrorCode, Event, ExpectedError, RunParams, Subscription,
+    ViewfinderParams, ViewfinderValues,
+};
+use serde_json::json;
+
+use super::exit::Exit;
+use super::failure::CommandFailure;
+use super::follow::Interrupts;
+use super::plan_file::read_plan;
+use super::printer::Printer;
+use super::show;
+
+/// Share of the pixels that may be saturated.
+const MAX_SATURATED: f64 = 1e-4;
+/// Exposures are tried until the longest that suits is known to this factor.
+const FACTOR: f64 = 1.02;
+/// Pictures by which an exposure is judged: few pixels may saturate, and some do so by noise alone, now and then.
+const PICTURES: u64 = 8;
+/// So many standard deviations of their number are allowed for.
+const CONFIDENCE: f64 = 1.6;
+/// A scene that could be this much brighter is worth opening the aperture for.
+const WORTHWHILE: f64 = 1.1;
+/// Averaging over more frames is not proposed.
+const MAX_AVERAGE: f64 = 64.0;
+/// How long a picture may take to come.
+const PATIENCE: Duration = Duration::from_secs(10);
+/// The viewfinder ends after this time even if nobody can end it any more.
+const VIEWFINDER: &str =
+    "kind = \"viewfinder\"\nname = \"expose\"\n[viewfinder]\npictures_per_s = 30\nseconds = 120\n";
+
+/// Tries exposures for a plan, and prints what it proposes.
+pub(super) fn expose(socket: &Path, path: &Path, printer: Printer) -> Result<Exit, CommandFailure> {
+    let text = read_plan(path)?;
+    let refused = |error| CommandFailure::of_plan(error, path, &text);
+    let mut client = Client::connect(socket)?;
+    client.check(&text).map_err(refused)?;
+    let exposures_us = Plan::parse(&text).ok().and_then(|plan| exposures(&plan.procedure));
+    let Some((shortest_us, longest_us)) = exposures_us else {
+        let message = "the plan has no exposures to choose: give a plan of kind \"sweep\" or \"film\"";
+        return Err(CommandFailure::Exposure(message.into()));
+    };
+    let tried = Trial::begin(socket)?.longest(shortest_us, longest_us)?;
+    let limited = limited(&text, tried.exposure_us)?;
+    let foreseen = client.check(&limited).map_err(|error| CommandFailure::of_plan(error, path, &limited))?;
+    let (plan, average) = averaged(&limited, &foreseen)?;
+    let report = match average {
+        Some(_) => client.check(&plan).map_err(|error| CommandFailure::of_plan(error, path, &plan))?,
+        None => foreseen,
+    };
+    let proposal = Proposed { tried, longest_us, average, report, plan };
+    printer.print(&proposal.value(), |_| proposal.text())?;
+    Ok(Exit::Done)
+}
+
+/// The shortest and the longest exposure of a plan.
+fn exposures(procedure: &Procedure) -> Option<(f64, f64)> {
+    let values = match procedure {
+        Procedure::Sweep(sweep) => {
+            let extra = sweep.extra.iter().flat_map(|grid| grid.exposure_us.values());
+            sweep.exposure_us.values().into_iter().chain(extra).collect()
+        }
+        Procedure::Film(film) => vec![film.exposure_us],
+        _ => return None,
+    };
+    Some((values.iter().copied().reduce(f64::min)?, values.iter().copied().reduce(f64::max)?))
+}
+
+/// The plan without longer exposures.
+fn limited(text: &str, most_us: f64) -> Result<String, CommandFailure> {
+    let limit = |axis: &Axis| {
+        let mut values: Vec<f64> = axis.values().into_iter().map(|us| us.min(most_us)).collect();
+        values.dedup();
+        let mut kept: Vec<f64> = Vec::new();
+        values.into_iter().for_each(|us| {
+            if !kept.contains(&us) {
+                kept.push(us)
+            }
+        });
+        Axis::of_values(kept)
+    };
+    changed(text, |procedure| match procedure {
+        Procedure::Sweep(sweep) => {
+            sweep.exposure_us = limit(&sweep.exposure_us);
+            sweep.extra.iter_mut().for_each(|grid| grid.exposure_us = limit(&grid.exposure_us));
+        }
+        Procedure::Film(film) => film.exposure_us = film.exposure_us.min(most_us),
+        _ => {}
+    })
+}
+
+/// The plan with as many frames per point that noise is as large as what averaging does not remove, and that number;
+/// `None` where nothing is averaged or foreseen.
+fn averaged(text: &str, foreseen: &CheckReport) -> Result<(String, Option<u32>), CommandFailure> {
+    let Some(ExpectedError { noise, bias, calibration, .. }) =
+        foreseen.advice.as_ref().map(|advice| advice.expected)
+    else {
+        return Ok((text.to_owned(), None));
+    };
+    let ratio = noise.median / bias.median.hypot(calibration.median).max(f64::MIN_POSITIVE);
+    let mut proposed = None;
+    let plan = changed(text, |procedure| {
+        if let Procedure::Sweep(sweep) = procedure {
+            let frames = (f64::from(sweep.average) * ratio * ratio).ceil();
+            sweep.average = frames.clamp(1.0, MAX_AVERAGE) as u32;
+            proposed = Some(sweep.average);
+        }
+    })?;
+    Ok((plan, proposed))
+}
+
+fn changed(text: &str, change: impl FnOnce(&mut Procedure)) -> Result<String, CommandFailure> {
+    let failed = |error: &dyn std::fmt::Display| CommandFailure::Exposure(error.to_string());
+    let mut plan = Plan::parse(text).map_err(|error| failed(&error))?;
+    let before = plan.procedure.clone();
+    change(&mut plan.procedure);
+    let table = match &plan.procedure {
+        procedure if *procedure == before => return Ok(text.to_owned()),
+        Procedure::Sweep(sweep) => sweep.to_toml(),
+        Procedure::Film(film) => film.to_toml(),
+        _ => return Ok(text.to_owned()),
+    };
+    with_tables(text, &table).map_err(|error| failed(&error))
+}
+
+/// What was found on the scene.
+struct Tried {
+    /// The longest exposure that suits.
+    exposure_us: f64,
+    /// Share of saturated pixels in it.
+    saturated: f64,
+    /// Whether the share is at most [`MAX_SATURATED`], beyond doubt as far as so many pixels can tell.
+    suits: bool,
+    /// By how much the scene could be brighter until too many pixels saturate.
+    headroom: f64,
+}
+
+/// A viewfinder that tries exposures. Ends it when it goes out of scope, on every way out.
+struct Trial {
+    client: Client,
+    events: Subscription,
+    interrupts: Interrupts,
+    pictures: u64,
+}
+
+impl Trial {
+    fn begin(socket: &Path) -> Result<Self, CommandFailure> {
+        let events = Client::connect(socket)?.subscribe()?;
+        let interrupts = Interrupts::new().map_err(CommandFailure::Signals)?;
+        let mut client = Client::connect(socket)?;
+        client.run(&RunParams { plan: VIEWFINDER.into(), ..RunParams::default() })?;
+        let mut trial = Self { client, events, interrupts, pictures: 0 };
+        trial.picture(None)?;
+        Ok(trial)
+    }
+
+    /// The longest exposure that leaves at most [`MAX_SATURATED`] of the pixels saturated.
+    fn longest(mut self, shortest_us: f64, longest_us: f64) -> Result<Tried, CommandFailure> {
+        let longest = self.look(longest_us)?;
+        if longest.suits {
+            return Ok(longest);
+        }
+        let mut best = self.look(shortest_us)?;
+        if !best.suits {
+            return Err(CommandFailure::Exposure(format!(
+                "{:.3} % of the pixels saturate even in the plan's shortest exposure, {shortest_us} us, and at most {:.2} % may: shorter exposures do not dim the light of a pixel's own row, which is a flash; close the aperture by a stop (or lower the gain by 2), set camera.white_dn to match, and try again",
+                100.0 * best.saturated,
+                100.0 * MAX_SATURATED
+            )));
+        }
+        let mut over_us = longest_us;
+        while over_us / best.exposure_us > FACTOR {
+            // Whole steps of a tenth of a microsecond, as plans are read by people.
+            let middle_us = ((best.exposure_us * over_us).sqrt() * 10.0).round() / 10.0;
+            if middle_us <= best.exposure_us || middle_us >= over_us {
+                break;
+            }
+            let middle = self.look(middle_us)?;
+            match middle.suits {
+                true => best = middle,
+                false => over_us = middle_us,
+            }
+        }
+        Ok(best)
+    }
+
+    /// Judges an exposure by several pictures.
+    fn look(&mut self, exposure_us: f64) -> Result<Tried, CommandFailure> {
+        self.client.viewfinder(&ViewfinderParams {
+            exposure_us: Some(exposure_us),
+            ..ViewfinderParams::default()
+        })?;
+        let (mut samples, mut saturated, mut headroom) = (0.0, 0.0, f64::INFINITY);
+        for _ in 0..PICTURES {
+            let values = self.picture(Some(exposure_us))?;
+            let pixels = values.histogram.iter().sum::<u64>() as f64;
+            samples += pixels;
+            saturated += values.saturated * pixels;
+            headroom = headroom.min(headroom_of(&values));
+        }
+        let suits =
+            saturated == 0.0 || saturated + CONFIDENCE * (saturated + 1.0).sqrt() <= MAX_SATURATED * samples;
+        Ok(Tried { exposure_us, saturated: saturated / samples, suits, headroom })
+    }
+
+    /// The next picture, of this exposure.
+    fn picture(&mut self, exposure_us: Option<f64>) -> Result<ViewfinderValues, CommandFailure> {
+        let began = Instant::now();
+        loop {
+            if self.interrupts.pending() {
+                return Err(CommandFailure::Exposure("interrupted: nothing is proposed".into()));
+            }
+            match self.events.next_within(Duration::from_millis(100))? {
+                Some(Event::Viewfinder(values)) => {
+                    let is_wanted = exposure_us.is_none_or(|us| values.exposure_us == us);
+                    if let Some(problem) = values.problem {
+                        return Err(CommandFailure::Exposure(problem));
+                    }
+                    if values.pictures > self.pictures && is_wanted {
+                        self.pictures = values.pictures;
+                        return Ok(*values);
+                    }
+                }
+                Some(Event::Finished { error, .. }) => {
+                    let why = error.unwrap_or_else(|| "the viewfinder was ended".into());
+                    return Err(CommandFailure::Exposure(why));
+                }
+                _ if began.elapsed() > PATIENCE => {
+                    return Err(CommandFailure::Exposure("no picture came for 10 s".into()));
+                }
+                _ => {}
+            }
+        }
+    }
+}
+
+impl Drop for Trial {
+    fn drop(&mut self) {
+        match self.client.cancel() {
+            Ok(()) => {}
+            Err(ClientError::Rpc(error)) if error.name() == Some(ErrorCode::NotRunning) => return,
+            Err(error) => return eprintln!("raysweep: the viewfinder is not known to have ended: {error}"),
+        }
+        let began = Instant::now();
+        while began.elapsed() < PATIENCE {
+            match self.events.next_within(Duration::from_millis(100)) {
+                Ok(Some(Event::Finished { .. })) | Err(ClientError::Lost { .. }) => return,
+                _ => {}
+            }
+        }
+    }
+}
+
+/// By how much the light of a picture could grow until more than [`MAX_SATURATED`] of the pixels saturate.
+fn headroom_of(values: &ViewfinderValues) -> f64 {
+    let pixels: u64 = values.histogram.iter().sum();
+    let allowed = (MAX_SATURATED * pixels as f64) as u64;
+    let mut above = 0;
+    let bar = values.histogram.iter().rposition(|bar| {
+        above += bar;
+        above > allowed
+    });
+    let upper_dn =
+        bar.map_or(0.0, |bar| (bar + 1) as f64 / values.histogram.len() as f64 * f64::from(values.full_dn));
+    // The bar's upper end, unless no pixel is as bright.
+    let level_dn = upper_dn.min(f64::from(values.brightest_dn));
+    (values.saturation_dn - values.black_dn) / (level_dn - values.black_dn).max(1.0)
+}
+
+/// What is proposed.
+struct Proposed {
+    tried: Tried,
+    /// The plan's longest exposure before.
+    longest_us: f64,
+    /// Frames per point, if there is a choice.
+    average: Option<u32>,
+    report: CheckReport,
+    plan: String,
+}
+
+impl Proposed {
+    fn value(&self) -> serde_json::Value {
+        let Self { tried: Tried { exposure_us, saturated, headroom, .. }, average, report, plan, .. } = self;
+        let expected = report.advice.as_ref().map(|advice| advice.expected);
+        json!({
+            "exposure_us": exposure_us, "saturated": saturated, "headroom": headroom, "average": average,
+            "light_s": report.light_s, "expected": expected, "plan": plan, "warnings": report.warnings,
+        })
+    }
+
+    fn text(&self) -> String {
+        let Self { tried, longest_us, average, report, plan } = self;
+        let Tried { exposure_us, saturated, headroom, .. } = tried;
+        let mut head = vec![format!(
+            "exposures up to {exposure_us} us: {:.3} % of the pixels saturate (at most {:.2} % may)",
+            100.0 * saturated,
+            100.0 * MAX_SATURATED
+        )];
+        if exposure_us < longest_us {
+            head.push(format!("longer ones, up to {longest_us} us, saturate more and are shortened"));
+        }
+        if *headroom > WORTHWHILE {
+            head.push(format!(
+                "the scene may be {headroom:.2} times as bright: open the aperture, or raise the gain, by that, multiply camera.white_dn by it, and try again"
+            ));
+        }
+        if let Some(average) = average {
+            head.push(format!(
+                "average = {average}: noise is then about as large as what averaging does not remove"
+            ));
+        }
+        head.push(format!("{:.2} s of light", report.light_s));
+        if let Some(advice) = &report.advice {
+            head.push(format!("expected error: {}", show::errors(&advice.expected)));
+        }
+        head.extend(report.warnings.iter().map(|warning| format!("warning: {warning}")));
+        let comments: String = head.into_iter().map(|comment| format!("# {comment}\n")).collect();
+        format!("{comments}{}", plan.trim_end())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use raysweep_core::FinderPicture;
+
+    use super::*;
+
+    #[test]
+    fn longer_exposures_are_shortened_and_the_rest_of_a_plan_stays() {
+        let text = "kind = \"sweep\"\nname = \"a\"\n[sweep]\nexposure_us = [100, 400, 800, 1200]\naverage = 3\n\
+                    [[sweep.extra]]\ndelay_us = [0]\nexposure_us = [900, 50]\n[[stage]]\nname = \"demux\"\nalpha = 0.5\n";
+        let plan = Plan::parse(&limited(text, 500.0).unwrap()).unwrap();
+        let Procedure::Sweep(sweep) = &plan.procedure else { panic!("{plan:?}") };
+        assert_eq!(sweep.exposure_us.values(), [100.0, 400.0, 500.0]);
+        assert_eq!(sweep.extra[0].exposure_us.values(), [500.0, 50.0]);
+        assert_eq!((sweep.average, plan.name.as_str(), plan.stages.len()), (3, "a", 1));
+        assert_eq!(exposures(&plan.procedure), Some((50.0, 500.0)));
+        assert_eq!(limited(text, 1200.0).unwrap(), text, "nothing to change");
+        let film = limited("kind = \"film\"\n[film]\nexposure_us = 700\n", 600.5).unwrap();
+        assert_eq!(exposures(&Plan::parse(&film).unwrap().procedure), Some((600.5, 600.5)));
+        assert_eq!(exposures(&Plan::parse("kind = \"darks\"\n").unwrap().procedure), None);
+    }
+
+    #[test]
+    fn headroom_leaves_out_as_many_pixels_as_may_saturate() {
+        let mut values = ViewfinderValues {
+            pictures: 1,
+            sequence: None,
+            picture: FinderPicture::White,
+            exposure_us: 1.0,
+            region: [0, 100, 0, 200],
+            black_dn: 64.0,
+            saturation_dn: 3964.0,
+            full_dn: 4095,
+            saturated: 0.0,
+            underexposed: 0.0,
+            mean_dn: 0.0,
+            brightest_dn: 4000,
+            histogram: vec![0; 64],
+            row_cut: Vec::new(),
+            column_cut: Vec::new(),
+            focus: None,
+            alignment: None,
+            dot: None,
+            problem: None,
+        };
+        values.histogram[30] = 19_998;
+        values.histogram[62] = 2;
+        let of = |level_dn: f64| 3900.0 / (level_dn - 64.0);
+        assert!((headroom_of(&values) - of(31.0 / 64.0 * 4095.0)).abs() < 1e-9, "2 of 20,000 may");
+        values.histogram[40] = 1;
+        assert!((headroom_of(&values) - of(41.0 / 64.0 * 4095.0)).abs() < 1e-9);
+        values.brightest_dn = 2000;
+        assert!((headroom_of(&values) - of(2000.0)).abs() < 1e-9);
+    }
+}

@@ -1,0 +1,312 @@
+//! The questions about a camera.
+
+use raysweep_core::{Packing, PixelFormat};
+use toml::{Table, Value};
+
+use super::found::ConnectedDevices;
+use super::questions::{AnswerChoice, Questions};
+use super::text::RigText;
+use crate::cli::failure::CommandFailure;
+
+const GENICAM: &str = "genicam";
+const V4L2: &str = "v4l2";
+const SIM: &str = "sim";
+/// Sides of a frame.
+const SIDE_PX: std::ops::RangeInclusive<u32> = 1..=65_536;
+
+/// The camera of the new rig.
+pub(super) enum ChosenCamera {
+    Sim,
+    Genicam {
+        address: AddressOrName,
+        format: PixelFormat,
+        region: Option<[u32; 4]>,
+        trigger: TriggerSetup,
+        size: (usize, usize),
+    },
+    V4l2 {
+        device: String,
+        format: PixelFormat,
+        size: (usize, usize),
+        controls: Vec<(String, i64)>,
+        delay: Option<String>,
+    },
+}
+
+/// How a GenICam camera is named.
+pub(super) enum AddressOrName {
+    Address(String),
+    Name(String),
+}
+
+/// A GenICam camera's trigger.
+pub(super) struct TriggerSetup {
+    source: String,
+    activation: String,
+    latency_us: f64,
+}
+
+/// What a camera offers, as far as it is known.
+#[derive(Default)]
+struct Offered {
+    formats: Vec<PixelFormat>,
+    /// Rows and columns.
+    sizes: Vec<(u32, u32)>,
+    trigger_sources: Vec<String>,
+}
+
+impl ChosenCamera {
+    /// Asks which camera, and how it is set.
+    pub fn ask(
+        questions: &mut Questions,
+        connected: &ConnectedDevices,
+        most_rows: Option<usize>,
+    ) -> Result<Self, CommandFailure> {
+        let mut choices: Vec<AnswerChoice> =
+            connected.cameras.iter().map(|eye| AnswerChoice::new(&eye.value, &eye.about)).collect();
+        choices.push(AnswerChoice::new(SIM, "simulated, to rehearse"));
+        let default = choices[0].value.clone();
+        let forms = ["genicam:NAME or ADDRESS", "v4l2:NODE"];
+        let chosen = questions.choose("camera", "Which camera?", &choices, &forms, Some(&default))?;
+        match chosen.split_once(':') {
+            Some((GENICAM, named)) => Self::genicam(questions, named, most_rows),
+            Some((V4L2, device)) => Self::v4l2(questions, device),
+            _ => Ok(Self::Sim),
+        }
+    }
+
+    fn genicam(
+        questions: &mut Questions,
+        named: &str,
+        most_rows: Option<usize>,
+    ) -> Result<Self, CommandFailure> {
+        let offered = offered_by_genicam(named)?;
+        let format = ask_format(questions, &offered)?;
+        let (sensor_rows, columns) = ask_size(questions, &offered)?;
+        let rows = most_rows.unwrap_or(usize::MAX).min(sensor_rows);
+        // The middle of the sensor, where a camera sees more rows than the projector draws.
+        let region = (rows < sensor_rows).then(|| {
+            let side = |pixels: usize| u32::try_from(pixels).unwrap_or(u32::MAX);
+            [0, side((sensor_rows - rows) / 2), side(columns), side(rows)]
+        });
+        let sources: Vec<AnswerChoice> =
+            offered.trigger_sources.iter().map(|source| AnswerChoice::new(source, "")).collect();
+        let is_line = |source: &&String| source.starts_with("Line");
+        let first_line = offered.trigger_sources.iter().find(is_line).map_or("Line0", |source| source);
+        let source = match sources.is_empty() {
+            true => questions.text(
+                "trigger_source",
+                "Which input of the camera does the VSYNC reach?",
+                first_line,
+            )?,
+            false => questions.choose(
+                "trigger_source",
+                "Which input of the camera does the VSYNC reach?",
+                &sources,
+                &[],
+                Some(first_line),
+            )?,
+        };
+        let activation = questions.choose(
+            "trigger_activation",
+            "Which edge of the pulse begins a frame? (Levels inverted on the way turn it round.)",
+            &[AnswerChoice::new("RisingEdge", ""), AnswerChoice::new("FallingEdge", "")],
+            &[],
+            Some("RisingEdge"),
+        )?;
+        let latency_us = questions.number(
+            "trigger_latency_us",
+            "Microseconds from the edge to the first row's exposure, by the camera's data sheet (0 if unknown)",
+            0.0,
+            0.0..=1e6,
+        )?;
+        let address = match named.parse::<std::net::IpAddr>() {
+            Ok(_) => AddressOrName::Address(named.into()),
+            Err(_) => AddressOrName::Name(named.into()),
+        };
+        let trigger = TriggerSetup { source, activation, latency_us };
+        Ok(Self::Genicam { address, format, region, trigger, size: (rows, columns) })
+    }
+
+    fn v4l2(questions: &mut Questions, device: &str) -> Result<Self, CommandFailure> {
+        let offered = offered_by_kernel(device);
+        let format = ask_format(questions, &offered)?;
+        let size = ask_size(questions, &offered)?;
+        let controls = questions.text(
+            "controls",
+            "Controls that set the external trigger and fix the gain, as `v4l2-ctl --list-ctrls` spells them: NAME=VALUE, ... (empty: none)",
+            "",
+        )?;
+        let controls = parse_controls(&controls)?;
+        let delay = questions.text(
+            "trigger_delay",
+            "The control that delays the trigger, in microseconds (empty: none; delays can then not be swept)",
+            "",
+        )?;
+        let delay = (!delay.is_empty()).then_some(delay);
+        Ok(Self::V4l2 { device: device.into(), format, size, controls, delay })
+    }
+
+    /// Whether it is simulated.
+    pub fn is_simulated(&self) -> bool {
+        matches!(self, Self::Sim)
+    }
+
+    /// Rows and columns of its frames, if they are known.
+    pub fn size(&self) -> Option<(usize, usize)> {
+        match self {
+            Self::Sim => None,
+            Self::Genicam { size, .. } | Self::V4l2 { size, .. } => Some(*size),
+        }
+    }
+
+    /// Its tables in the rig file.
+    pub fn write(&self, text: RigText) -> RigText {
+        let text = text.table("camera");
+        match self {
+            Self::Sim => text.key("driver", SIM),
+            Self::Genicam { address, format, region, trigger, .. } => {
+                let text = levels(text.key("driver", "aravis").key("pixel_format", format.to_string()));
+                let text = text.table("camera.aravis");
+                let text = match address {
+                    AddressOrName::Address(address) => text.key("address", address.as_str()),
+                    AddressOrName::Name(name) => text.key("name", name.as_str()),
+                };
+                let text = match region {
+                    Some(region) => {
+                        text.key_with("region", region_of(*region), "no more rows than the projector draws")
+                    }
+                    None => text,
+                };
+                text.key_with("trigger_source", trigger.source.as_str(), "where the VSYNC comes in")
+                    .key("trigger_activation", trigger.activation.as_str())
+                    .key_with(
+                        "trigger_latency_us",
+                        trigger.latency_us,
+                        "[A] unless from the data sheet; from the edge to the first row's exposure",
+                    )
+                    .key_with(
+                        "timestamp_at",
+                        "exposure_start",
+                        "[A] what the camera's time stamps refer to; see its data sheet",
+                    )
+            }
+            Self::V4l2 { device, format, size: (rows, columns), controls, delay } => {
+                let text = levels(text.key("driver", V4L2).key("pixel_format", format.to_string()));
+                let controls: Vec<Value> = controls
+                    .iter()
+                    .map(|(name, value)| Value::Array(vec![name.as_str().into(), (*value).into()]))
+                    .collect();
+                let text = text
+                    .table("camera.v4l2")
+                    .key_with("device", device.as_str(), "a path below /dev/v4l/by-id stays with the camera")
+                    .key("width", *columns as i64)
+                    .key("height", *rows as i64)
+                    .key_with(
+                        "controls",
+                        controls,
+                        "written in this order; also switch automatic functions off here",
+                    );
+                match delay {
+                    Some(control) => {
+                        let table = Table::from_iter([
+                            ("control".to_owned(), Value::from(control.as_str())),
+                            ("unit_us".to_owned(), Value::from(1)),
+                        ]);
+                        text.key("trigger_delay", table)
+                    }
+                    None => text,
+                }
+            }
+        }
+    }
+}
+
+/// What `raysweep calibrate` measures.
+fn levels(text: RigText) -> RigText {
+    text.comment("white_dn and black_dn, counts of white and of darkness, are found by `raysweep calibrate`.")
+}
+
+fn region_of([x, y, width, height]: [u32; 4]) -> Table {
+    let sides = [("x", x), ("y", y), ("width", width), ("height", height)];
+    sides.into_iter().map(|(name, pixels)| (name.to_owned(), Value::from(i64::from(pixels)))).collect()
+}
+
+fn parse_controls(text: &str) -> Result<Vec<(String, i64)>, CommandFailure> {
+    let control = |part: &str| {
+        let parsed = part
+            .split_once('=')
+            .and_then(|(name, value)| Some((name.trim().to_owned(), value.trim().parse().ok()?)));
+        parsed.ok_or_else(|| {
+            CommandFailure::Setup(format!(
+                "controls: {part:?}; allowed: NAME=WHOLE NUMBER, separated by commas"
+            ))
+        })
+    };
+    text.split(',').map(str::trim).filter(|part| !part.is_empty()).map(control).collect()
+}
+
+/// The format with the most bits in the fewest bytes is the best.
+fn ask_format(questions: &mut Questions, offered: &Offered) -> Result<PixelFormat, CommandFailure> {
+    let rank = |format: &PixelFormat| match format.packing {
+        Packing::Bits12p | Packing::Bits12g24 => 0,
+        Packing::Bits12Packed => 1,
+        Packing::Bits12 => 2,
+        Packing::Bits16 => 3,
+        Packing::Bits10p | Packing::Bits10g40 | Packing::Bits10Packed => 4,
+        Packing::Bits10 => 5,
+        Packing::Bits8 => 6,
+    };
+    let mut formats = offered.formats.clone();
+    formats.sort_by_key(rank);
+    let choices: Vec<AnswerChoice> =
+        formats.iter().map(|format| AnswerChoice::new(format.to_string(), "")).collect();
+    const KEY: &str = "pixel_format";
+    let question = "Which pixel format? 12 bits are best; packed ones need less of the link";
+    let name = match choices.first() {
+        Some(first) => questions.choose(KEY, question, &choices, &[], Some(&first.value))?,
+        None => questions.text(KEY, question, "Mono12")?,
+    };
+    name.parse()
+        .map_err(|error: raysweep_core::UnknownPixelFormat| CommandFailure::Setup(format!("{KEY}: {error}")))
+}
+
+/// Rows and columns of a frame.
+fn ask_size(questions: &mut Questions, offered: &Offered) -> Result<(usize, usize), CommandFailure> {
+    let (rows, columns) = offered.sizes.first().copied().unwrap_or((720, 1280));
+    let width = questions.whole("width", "Columns of a frame", columns, SIDE_PX)?;
+    let height = questions.whole("height", "Rows of a frame", rows, SIDE_PX)?;
+    Ok((height as usize, width as usize))
+}
+
+#[cfg(feature = "aravis")]
+fn offered_by_genicam(named: &str) -> Result<Offered, CommandFailure> {
+    let facts = raysweep_drivers::camera::aravis::facts(named)?;
+    Ok(Offered {
+        formats: facts.pixel_formats,
+        sizes: facts.sensor.into_iter().collect(),
+        trigger_sources: facts.trigger_sources,
+    })
+}
+
+#[cfg(not(feature = "aravis"))]
+fn offered_by_genicam(_: &str) -> Result<Offered, CommandFailure> {
+    Err(CommandFailure::WithoutAravis)
+}
+
+#[cfg(feature = "v4l2")]
+fn offered_by_kernel(device: &str) -> Offered {
+    let node =
+        raysweep_drivers::camera::v4l2::nodes().into_iter().find(|node| node.path.as_os_str() == device);
+    let formats = node.map(|node| node.formats).unwrap_or_default();
+    Offered {
+        sizes: formats.iter().flat_map(|(_, sizes)| sizes).map(|(width, height)| (*height, *width)).collect(),
+        formats: formats.into_iter().map(|(format, _)| format).collect(),
+        trigger_sources: Vec::new(),
+    }
+}
+
+#[cfg(not(feature = "v4l2"))]
+fn offered_by_kernel(_: &str) -> Offered {
+    Offered::default()
+}

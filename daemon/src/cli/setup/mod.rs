@@ -1,0 +1,132 @@
+//! `raysweep setup`: from connected devices to a first rig file. Moves no mirror and turns no light on.
+
+mod camera;
+mod dots;
+mod found;
+mod plane;
+mod questions;
+mod text;
+
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use raysweep_config::rig::AnyRigFile;
+use raysweep_config::{ConfigError, Plan};
+use raysweep_core::io_text;
+use raysweep_drivers::search::ask;
+use serde_json::json;
+
+use self::found::{ConnectedDevices, answer_text};
+use self::questions::{AnswerChoice, Questions};
+use super::exit::Exit;
+use super::failure::CommandFailure;
+use super::printer::Printer;
+
+/// A first sweep: few points, so that something is seen soon.
+const FIRST_SWEEP: &str = "\
+# A first look, written by `raysweep setup`: 7 delays, 2 exposures, 2 frames each.
+kind = \"sweep\"
+name = \"first look\"
+
+[sweep]
+delay_us = { start = -900, stop = 900, count = 7 }
+exposure_us = [400, 800]
+average = 2
+";
+
+/// What is written, and where.
+pub struct SetupFiles<'a> {
+    pub answers: Option<&'a Path>,
+    pub rig: &'a Path,
+    pub plan: &'a Path,
+    /// Whether existing files are replaced.
+    pub force: bool,
+}
+
+/// Finds what is connected, asks for the rest, and writes a rig file and a first plan.
+pub fn setup(files: &SetupFiles<'_>, printer: Printer) -> Result<Exit, CommandFailure> {
+    let SetupFiles { answers, rig, plan, force } = *files;
+    // Before anything is asked: answers should not be lost.
+    if let Some(there) = [rig, plan].into_iter().find(|path| !force && path.exists()) {
+        return Err(CommandFailure::Setup(format!(
+            "{} is there already: name another file with --rig or --plan, or replace it with --force",
+            there.display()
+        )));
+    }
+    let mut questions = Questions::of(answers)?;
+    let mut connected = ConnectedDevices::search();
+    let is_spoken = !printer.json;
+    if is_spoken {
+        println!("{}", connected.text());
+    }
+    ask_ports(&mut questions, &mut connected, is_spoken)?;
+    let kinds = [
+        AnswerChoice::new("plane", "a raster projector and a rolling-shutter camera"),
+        AnswerChoice::new("dots", "a MEMS mirror that moves a dot, and a fast camera"),
+    ];
+    let kind = questions.choose("kind", "Which kind of rig?", &kinds, &[], Some("plane"))?;
+    let (rig_text, plan_text) = match kind.as_str() {
+        "dots" => dots::ask(&mut questions, &connected)?,
+        _ => (plane::ask(&mut questions, &connected)?, FIRST_SWEEP.to_owned()),
+    };
+    questions.finish()?;
+    check(rig, &rig_text, AnyRigFile::parse(&rig_text).map(drop))?;
+    check(plan, &plan_text, Plan::parse(&plan_text).map(drop))?;
+    write(rig, &rig_text, force)?;
+    write(plan, &plan_text, force)?;
+    let value = json!({ "rig": rig, "plan": plan, "connected": connected });
+    printer.print(&value, |_| {
+        format!(
+            "written: {0} and {1}\nnext: `raysweep doctor --rig {0}`; then start the daemon with it, `raysweep calibrate`, and `raysweep run {1}`",
+            rig.display(),
+            plan.display()
+        )
+    })?;
+    Ok(Exit::Done)
+}
+
+/// Asks the ports that the operator agrees to what is connected there.
+fn ask_ports(
+    questions: &mut Questions,
+    connected: &mut ConnectedDevices,
+    is_spoken: bool,
+) -> Result<(), CommandFailure> {
+    let ports: Vec<String> =
+        connected.serial_ports.iter().map(|port| port.path.display().to_string()).collect();
+    let chosen = questions.choose_many(
+        "ask_ports",
+        "Ask serial ports for mirror controllers and triggerboxes? That resets some boards, and may confuse other devices, so name only ports whose device you know to be one of these",
+        &ports,
+    )?;
+    for port in chosen.into_iter().map(PathBuf::from) {
+        let answer = ask(&port);
+        if is_spoken {
+            println!("{}: {}", port.display(), answer_text(answer.as_ref()));
+        }
+        connected.answering.push((port, answer));
+    }
+    Ok(())
+}
+
+/// Holds a text against the rules of its file: what was asked for may not go together.
+fn check(path: &Path, text: &str, parsed: Result<(), ConfigError>) -> Result<(), CommandFailure> {
+    parsed.map_err(|error| {
+        let shown = error.render(&path.display().to_string(), text);
+        CommandFailure::Setup(format!("the answers do not go together; nothing is written:\n{shown}"))
+    })
+}
+
+fn write(path: &Path, text: &str, force: bool) -> Result<(), CommandFailure> {
+    let failed = |source: io::Error| CommandFailure::Write { path: path.to_owned(), source };
+    if force {
+        return fs::write(path, text).map_err(failed);
+    }
+    let mut file = File::create_new(path).map_err(|error| match error.kind() {
+        io::ErrorKind::AlreadyExists => {
+            CommandFailure::Setup(format!("{}: {}", path.display(), io_text(&error)))
+        }
+        _ => failed(error),
+    })?;
+    file.write_all(text.as_bytes()).map_err(failed)
+}

@@ -1,0 +1,272 @@
+//! Questions to an operator at a terminal, or to a file of answers.
+
+use std::fmt::Write as _;
+use std::fs;
+use std::io::{self, BufRead, IsTerminal, Write};
+use std::ops::RangeInclusive;
+use std::path::{Path, PathBuf};
+
+use toml::{Table, Value};
+
+use crate::cli::failure::CommandFailure;
+
+/// An answer that may be chosen.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct AnswerChoice {
+    pub value: String,
+    /// What it is, for people.
+    pub about: String,
+}
+
+impl AnswerChoice {
+    pub fn new(value: impl Into<String>, about: impl Into<String>) -> Self {
+        Self { value: value.into(), about: about.into() }
+    }
+}
+
+/// Asks a person, or a file.
+pub(super) enum Questions {
+    /// The answers of a file that are not asked for yet.
+    File { path: PathBuf, answers: Table },
+    /// A person.
+    Terminal,
+}
+
+type Answer<T> = Result<T, CommandFailure>;
+
+fn refused<T>(what: impl Into<String>) -> Answer<T> {
+    Err(CommandFailure::Setup(what.into()))
+}
+
+impl Questions {
+    /// Questions to a file, or, without one, to the person at the terminal.
+    ///
+    /// # Errors
+    /// When the file cannot be read, or nobody is at a terminal.
+    pub fn of(file: Option<&Path>) -> Answer<Self> {
+        let Some(path) = file else {
+            return match io::stdin().is_terminal() {
+                true => Ok(Self::Terminal),
+                false => refused("nobody to ask: call it at a terminal, or give --answers FILE"),
+            };
+        };
+        let text = fs::read_to_string(path)
+            .map_err(|source| CommandFailure::File { path: path.to_owned(), source })?;
+        let parsed: Result<Table, _> = text.parse();
+        match parsed {
+            Ok(answers) => Ok(Self::File { path: path.to_owned(), answers }),
+            Err(error) => refused(format!("{}: {error}", path.display())),
+        }
+    }
+
+    /// Asks for one of `choices`, or for a value of one of the `forms`, such as `triggerbox:PORT`. `default`, if any,
+    /// stands for no answer.
+    pub fn choose(
+        &mut self,
+        key: &str,
+        question: &str,
+        choices: &[AnswerChoice],
+        forms: &[&str],
+        default: Option<&str>,
+    ) -> Answer<String> {
+        let fits = |value: &str| {
+            choices.iter().any(|choice| choice.value == value)
+                || forms.iter().any(|form| {
+                    let kind = form.split_once(':').map_or(*form, |(kind, _)| kind);
+                    value.split_once(':').is_some_and(|(of, name)| of == kind && !name.is_empty())
+                })
+        };
+        let values = choices.iter().map(|choice| choice.value.as_str()).chain(forms.iter().copied());
+        let allowed = format!("allowed: {}", values.collect::<Vec<_>>().join(", "));
+        if let Self::File { .. } = self {
+            let given = self.given(key, "a string", |value| value.as_str().map(str::to_owned))?;
+            return match given.or_else(|| default.map(str::to_owned)) {
+                Some(value) if fits(&value) => Ok(value),
+                Some(value) => refused(format!("{}{key} = {value:?}; {allowed}", self.place())),
+                None => refused(format!("{}{key} is missing: {question}; {allowed}", self.place())),
+            };
+        }
+        let mut prompt = format!("{question}\n");
+        for (number, AnswerChoice { value, about }) in (1..).zip(choices) {
+            let _ = writeln!(prompt, "  {number}  {value:<24} {about}");
+        }
+        for form in forms {
+            let _ = writeln!(prompt, "     {form}");
+        }
+        loop {
+            let line = asked(&prompt, default)?;
+            let numbered = line.parse::<usize>().ok().and_then(|number| choices.get(number.checked_sub(1)?));
+            let value = numbered.map_or(line, |choice| choice.value.clone());
+            if fits(&value) {
+                return Ok(value);
+            }
+            prompt = format!("{value:?} is none of them; {allowed}\n");
+        }
+    }
+
+    /// Asks for a number.
+    pub fn number(
+        &mut self,
+        key: &str,
+        question: &str,
+        default: f64,
+        allowed: RangeInclusive<f64>,
+    ) -> Answer<f64> {
+        let range = format!("allowed: {} to {}", allowed.start(), allowed.end());
+        if let Self::File { .. } = self {
+            let number = |value: &Value| value.as_float().or(value.as_integer().map(|whole| whole as f64));
+            let value = self.given(key, "a number", number)?.unwrap_or(default);
+            return match allowed.contains(&value) {
+                true => Ok(value),
+                false => refused(format!("{}{key} = {value}; {range}", self.place())),
+            };
+        }
+        let mut prompt = format!("{question}, {range}\n");
+        loop {
+            let line = asked(&prompt, Some(&default.to_string()))?;
+            match line.parse() {
+                Ok(value) if allowed.contains(&value) => return Ok(value),
+                _ => prompt = format!("{line:?} is no number in this range; {range}\n"),
+            }
+        }
+    }
+
+    /// Asks for a whole number.
+    pub fn whole(
+        &mut self,
+        key: &str,
+        question: &str,
+        default: u32,
+        allowed: RangeInclusive<u32>,
+    ) -> Answer<u32> {
+        let (first, last) = (*allowed.start(), *allowed.end());
+        let value = self.number(key, question, f64::from(default), f64::from(first)..=f64::from(last))?;
+        match value.fract() == 0.0 {
+            true => Ok(value as u32),
+            false => {
+                refused(format!("{}{key} = {value}; allowed: whole numbers, {first} to {last}", self.place()))
+            }
+        }
+    }
+
+    /// Asks for a text, which may be empty if the default is.
+    pub fn text(&mut self, key: &str, question: &str, default: &str) -> Answer<String> {
+        if let Self::File { .. } = self {
+            let given = self.given(key, "a string", |value| value.as_str().map(str::to_owned))?;
+            return Ok(given.unwrap_or_else(|| default.into()));
+        }
+        asked(&format!("{question}\n"), Some(default))
+    }
+
+    /// Asks which of `choices` to take, none by default.
+    pub fn choose_many(&mut self, key: &str, question: &str, choices: &[String]) -> Answer<Vec<String>> {
+        if let Self::File { .. } = self {
+            let strings = |value: &Value| {
+                let values = value.as_array()?.iter();
+                values.map(|value| value.as_str().map(str::to_owned)).collect::<Option<Vec<_>>>()
+            };
+            return Ok(self.given(key, "a list of strings", strings)?.unwrap_or_default());
+        }
+        if choices.is_empty() {
+            return Ok(Vec::new());
+        }
+        let prompt = format!("{question}\n  {}\n", choices.join("\n  "));
+        let line = asked(&format!("{prompt}all, none, or paths separated by spaces"), Some("none"))?;
+        Ok(match line.as_str() {
+            "none" => Vec::new(),
+            "all" => choices.to_vec(),
+            paths => paths.split_whitespace().map(str::to_owned).collect(),
+        })
+    }
+
+    /// Ends the questions.
+    ///
+    /// # Errors
+    /// For answers of a file to questions that were not asked.
+    pub fn finish(self) -> Answer<()> {
+        match &self {
+            Self::File { answers, .. } if !answers.is_empty() => {
+                let keys: Vec<&str> = answers.keys().map(String::as_str).collect();
+                let keys = keys.join(", ");
+                refused(format!("{}{keys}: not asked for with the other answers; remove it", self.place()))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// The answer of a file to `key`, if it has one.
+    fn given<T>(&mut self, key: &str, wanted: &str, read: impl Fn(&Value) -> Option<T>) -> Answer<Option<T>> {
+        let place = self.place();
+        let Self::File { answers, .. } = self else { return Ok(None) };
+        let Some(value) = answers.remove(key) else { return Ok(None) };
+        match read(&value) {
+            Some(given) => Ok(Some(given)),
+            None => refused(format!("{place}{key} = {value}; allowed: {wanted}")),
+        }
+    }
+
+    fn place(&self) -> String {
+        match self {
+            Self::File { path, .. } => format!("{}: ", path.display()),
+            Self::Terminal => String::new(),
+        }
+    }
+}
+
+/// One line of the person at the terminal; nothing stands for the default.
+fn asked(prompt: &str, default: Option<&str>) -> Answer<String> {
+    let shown = default.filter(|default| !default.is_empty());
+    let default_text = shown.map_or(String::new(), |default| format!(" [{default}]"));
+    print!("{}{default_text}: ", prompt.trim_end());
+    io::stdout().flush().map_err(CommandFailure::Output)?;
+    let mut line = String::new();
+    let read = io::stdin().lock().read_line(&mut line);
+    match read {
+        Ok(0) => refused("the questions were not answered: nothing is written"),
+        Ok(_) => {
+            let line = line.trim();
+            Ok(if line.is_empty() { default.unwrap_or_default().to_owned() } else { line.to_owned() })
+        }
+        Err(error) => refused(format!("cannot read the answer: {}", raysweep_core::io_text(&error))),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn questions(answers: &str) -> Questions {
+        Questions::File { path: "answers.toml".into(), answers: answers.parse().unwrap() }
+    }
+
+    fn message<T: std::fmt::Debug>(answer: Answer<T>) -> String {
+        answer.unwrap_err().to_string()
+    }
+
+    #[test]
+    fn answers_of_a_file_are_held_against_what_is_allowed() {
+        let choices = [AnswerChoice::new("sim", "simulated")];
+        let choose = |text: &str, default| {
+            questions(text).choose("vsync", "What watches?", &choices, &["pps:SOURCE"], default)
+        };
+        assert_eq!(choose("vsync = 'sim'", None).unwrap(), "sim");
+        assert_eq!(choose("vsync = 'pps:/dev/pps0'", None).unwrap(), "pps:/dev/pps0");
+        assert_eq!(choose("", Some("sim")).unwrap(), "sim");
+        for (wrong, part) in [
+            ("vsync = 'pps:'", "answers.toml: vsync = \"pps:\"; allowed: sim, pps:SOURCE"),
+            ("vsync = 1", "allowed: a string"),
+            ("", "vsync is missing: What watches?; allowed: sim, pps:SOURCE"),
+        ] {
+            let found = message(choose(wrong, None));
+            assert!(found.contains(part), "{found}");
+        }
+        let number = |text: &str| questions(text).number("rows", "Rows?", 720.0, 1.0..=8192.0);
+        assert_eq!((number("rows = 360").unwrap(), number("").unwrap()), (360.0, 720.0));
+        assert!(message(number("rows = nan")).contains("allowed: 1 to 8192"));
+        assert!(message(number("rows = 'many'")).contains("a number"));
+        let whole = |text: &str| questions(text).whole("rows", "Rows?", 720, 1..=8192);
+        assert_eq!(whole("rows = 360.0").unwrap(), 360);
+        assert!(message(whole("rows = 1.5")).contains("allowed: whole numbers, 1 to 8192"));
+        assert!(message(questions("colour = 'red'").finish()).contains("colour: not asked for"));
+    }
+}

@@ -1,0 +1,87 @@
+//! `raysweep viewfinder`: starts a viewfinder, or changes the one that runs.
+
+use std::path::{Path, PathBuf};
+
+use raysweep_proto::{Client, RunState, ViewfinderParams};
+
+use super::arguments::ViewfinderArguments;
+use super::exit::Exit;
+use super::failure::CommandFailure;
+use super::plan_file::read_plan;
+use super::printer::Printer;
+
+impl ViewfinderArguments {
+    /// A plan with what is given.
+    fn plan(&self) -> String {
+        let mut plan = "kind = \"viewfinder\"\n[viewfinder]\n".to_owned();
+        let picture = self.picture.map(|picture| format!("picture = \"{}\"\n", picture.name()));
+        let region = self.region.map(|region| format!("region = {region:?}\n"));
+        let exposure = self.exposure_us.map(|exposure_us| format!("exposure_us = {exposure_us:?}\n"));
+        let subject = self.board.then(|| "subject = \"board\"\n".to_owned());
+        let seconds = self.seconds.map(|seconds| format!("seconds = {seconds:?}\n"));
+        plan.extend([picture, region, exposure, subject, seconds].into_iter().flatten());
+        plan
+    }
+}
+
+/// What remains to be done: a viewfinder to be started with this plan, or nothing, because one runs and was changed.
+pub(super) enum Wanted {
+    /// The path that messages name, and the text.
+    Plan(PathBuf, String),
+    Changed,
+}
+
+/// Changes the viewfinder that runs; otherwise returns the plan of one to start.
+pub(super) fn change_or_plan(
+    socket: &Path,
+    arguments: &ViewfinderArguments,
+) -> Result<Wanted, CommandFailure> {
+    let mut client = Client::connect(socket)?;
+    let status = client.status()?;
+    let is_over = matches!(status.state, RunState::Idle | RunState::Faulted);
+    if let (false, Some(_), None) = (is_over, &status.viewfinder, &arguments.plan) {
+        let ViewfinderArguments { picture, region, exposure_us, .. } = *arguments;
+        client.viewfinder(&ViewfinderParams { picture, region, exposure_us })?;
+        return Ok(Wanted::Changed);
+    }
+    match &arguments.plan {
+        Some(path) => Ok(Wanted::Plan(path.clone(), read_plan(path)?)),
+        None => Ok(Wanted::Plan("viewfinder".into(), arguments.plan())),
+    }
+}
+
+/// Says that the running viewfinder was changed.
+pub(super) fn changed(printer: Printer) -> Result<Exit, CommandFailure> {
+    printer.print(&raysweep_proto::Empty {}, |_| "the running viewfinder was changed".into())?;
+    Ok(Exit::Done)
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+    use raysweep_config::{Plan, Procedure};
+    use raysweep_core::FinderPicture;
+
+    use super::super::arguments::{Arguments, Command};
+
+    #[test]
+    fn arguments_become_a_plan() {
+        let line =
+            "raysweep viewfinder --picture grid --region 1,2,3,4 --exposure-us 5 --board --seconds 2.5";
+        let Command::Viewfinder(arguments) = Arguments::parse_from(line.split(' ')).command else {
+            panic!("another command")
+        };
+        let plan = Plan::parse(&arguments.plan()).unwrap();
+        let Procedure::Viewfinder(own) = plan.procedure else { panic!("{plan:?}") };
+        assert_eq!((own.picture, own.region), (FinderPicture::Grid, Some([1, 2, 3, 4])));
+        assert_eq!((own.exposure_us, own.seconds), (Some(5.0), Some(2.5)));
+        assert!(own.subject.is_some());
+    }
+
+    #[test]
+    fn a_region_has_four_numbers() {
+        for region in ["1,2,3", "1,2,3,-4", "1,2,3,4,5", "all"] {
+            assert!(Arguments::try_parse_from(["raysweep", "viewfinder", "--region", region]).is_err());
+        }
+    }
+}

@@ -1,0 +1,125 @@
+//! The data folder: permission, room and speed.
+
+use std::fs::File;
+use std::io::{self, Write};
+use std::path::Path;
+use std::time::Instant;
+
+use raysweep_core::{Size, io_text};
+use raysweep_session::durable;
+
+use super::PlanNeeds;
+use super::checkup::Checkup;
+
+/// Written to measure the disk: more than the caches of a slow disk's controller.
+const TEST_BYTES: usize = 32 << 20;
+const BLOCK_BYTES: usize = 1 << 20;
+/// Less room than this is little for any run.
+const LITTLE_ROOM_BYTES: u64 = 1 << 30;
+/// A disk that is this much faster than a plan needs keeps up while other programs write.
+const RESERVE: f64 = 2.0;
+
+const OLD_SESSIONS: &str = "`raysweep sessions` lists sessions: move old ones to another disk, or delete them by `raysweep trash --for-good`";
+
+pub(super) fn examine(checkup: &mut Checkup, data: &Path, needs: Option<PlanNeeds>) {
+    const FOLDER: &str = "data folder";
+    let speed = match speed(data) {
+        Ok(bytes_per_s) => bytes_per_s,
+        Err(error) => {
+            let found = format!("{} cannot be written: {}", data.display(), io_text(&error));
+            let remedy = match error.kind() {
+                io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => OLD_SESSIONS.into(),
+                _ => format!(
+                    "`mkdir -p {0} && chown {1}: {0}` as root, or give the daemon another --data",
+                    data.display(),
+                    super::host::user()
+                ),
+            };
+            return checkup.failure(FOLDER, found, remedy);
+        }
+    };
+    let free_bytes = durable::available_bytes(data).unwrap_or(0);
+    let needed_bytes = needs.map_or(LITTLE_ROOM_BYTES, |needs| needs.disk_bytes);
+    let found = format!("{}, {} free", data.display(), Size(free_bytes));
+    if free_bytes < needed_bytes {
+        let of = if needs.is_some() { "the plan needs" } else { "a run may need" };
+        let found = format!("{found}; {of} {}", Size(needed_bytes));
+        checkup.warning(FOLDER, found, OLD_SESSIONS);
+    } else {
+        checkup.ok(FOLDER, found);
+    }
+    examine_speed(checkup, speed, needs);
+}
+
+fn examine_speed(checkup: &mut Checkup, bytes_per_s: f64, needs: Option<PlanNeeds>) {
+    const DISK: &str = "disk";
+    let mb = |bytes_per_s: f64| format!("{:.0} MB/s", bytes_per_s / 1e6);
+    let Some(needs) = needs else {
+        return checkup
+            .ok(DISK, format!("writes {}; give a plan to compare with its needs", mb(bytes_per_s)));
+    };
+    let needed = needs.disk_bytes as f64 / needs.light_s.max(1e-3);
+    let found = format!("writes {}; the plan needs {}", mb(bytes_per_s), mb(needed));
+    if bytes_per_s < RESERVE * needed {
+        checkup.warning(DISK, found, "give the daemon a --data on a faster disk, such as an NVMe drive");
+    } else {
+        checkup.ok(DISK, found);
+    }
+}
+
+/// Speed at which the folder's disk takes data for good, in bytes per second. Makes the folder if it is missing.
+fn speed(folder: &Path) -> io::Result<f64> {
+    std::fs::create_dir_all(folder)?;
+    let path = folder.join(format!(".raysweep-doctor-{}", std::process::id()));
+    let file = File::create_new(&path)?;
+    // A file without a name leaves nothing behind, however this ends.
+    std::fs::remove_file(&path)?;
+    write_for_good(file)
+}
+
+fn write_for_good(mut file: File) -> io::Result<f64> {
+    // Disks that compress would be too fast with zeros.
+    let mut block = vec![0_u8; BLOCK_BYTES];
+    let mut state = 1_u32;
+    block.iter_mut().for_each(|byte| {
+        state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        *byte = state.to_le_bytes()[3];
+    });
+    let began = Instant::now();
+    for _ in 0..TEST_BYTES / BLOCK_BYTES {
+        file.write_all(&block)?;
+    }
+    file.sync_data()?;
+    Ok(TEST_BYTES as f64 / began.elapsed().as_secs_f64())
+}
+
+#[cfg(test)]
+mod tests {
+    use raysweep_proto::Grade;
+
+    use super::*;
+
+    #[test]
+    fn a_disk_is_held_against_the_plan_and_nothing_is_left_in_the_folder() {
+        let folder = tempfile::tempdir().unwrap();
+        let data = folder.path().join("data");
+        let mut checkup = Checkup::default();
+        examine(&mut checkup, &data, Some(PlanNeeds { disk_bytes: 1, light_s: 10.0 }));
+        examine(&mut checkup, &data, Some(PlanNeeds { disk_bytes: u64::MAX, light_s: 10.0 }));
+        let grades: Vec<Grade> = checkup.checks().iter().map(|check| check.grade).collect();
+        assert_eq!(grades, [Grade::Ok, Grade::Ok, Grade::Warning, Grade::Warning]);
+        assert_eq!(std::fs::read_dir(&data).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn a_folder_that_cannot_be_written_is_named_with_the_remedy() {
+        let folder = tempfile::tempdir().unwrap();
+        let data = folder.path().join("file");
+        std::fs::write(&data, "").unwrap();
+        let mut checkup = Checkup::default();
+        examine(&mut checkup, &data, None);
+        let [check] = checkup.checks() else { panic!("one check") };
+        assert_eq!((check.name.as_str(), check.grade), ("data folder", Grade::Failure));
+        assert!(check.remedy.as_ref().unwrap().contains("chown"), "{check:?}");
+    }
+}

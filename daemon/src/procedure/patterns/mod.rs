@@ -1,0 +1,125 @@
+//! Images under many pictures: shows each picture once, and takes all of its images before the next.
+
+mod check;
+
+use std::sync::Arc;
+
+use raysweep_config::plan::PatternsPlan;
+use raysweep_config::{ConfigError, Plan};
+use raysweep_core::SettingsId;
+use raysweep_processing::calibration::KeptCalibration;
+use raysweep_processing::patterns::{Made, PatternsTask, make};
+use raysweep_processing::plane::Processing;
+use raysweep_proto::RpcError;
+use raysweep_session::Session;
+use raysweep_session::ledger::{EndEntry, EndState, Entry};
+use raysweep_session::stack::StackShape;
+
+use crate::plane::{Opened, Passes, PointSink, Taken, missing, regular_again};
+use crate::procedure::lab::{Lab, RigOfRun, keep_calibration};
+use crate::rig::Rig;
+use crate::run::error::RunError;
+use crate::run::life::{Ended, Foreseen, Measurement, Run, end_entry, end_state};
+use crate::run::progress::ProgressMeter;
+
+/// Capacity of the queue of images between the assembler and the disk.
+const UNITS_UNDER_WAY: usize = 8;
+
+/// Images under pictures on a rig.
+struct PatternsRun {
+    rig: Arc<Rig>,
+    calibration: Option<KeptCalibration>,
+    patterns: PatternsTask,
+}
+
+/// Predicts a run under pictures.
+///
+/// # Errors
+/// For a plan that cannot be run on this rig.
+pub fn foresee(
+    lab: &Lab<'_>,
+    rig: RigOfRun<'_>,
+    plan: &Plan,
+    own: PatternsPlan,
+) -> Result<Foreseen, ConfigError> {
+    let patterns = PatternsTask::new(plan, own, &rig.known()?)?;
+    Ok(Foreseen {
+        report: rig.warned(check::check(&patterns, lab)?),
+        kind: plan.procedure.kind(),
+        name: plan.name.clone(),
+        shape: StackShape { contents: patterns.contents(), rows: rig.size.0, columns: rig.size.1 },
+        first_row: rig.first_row,
+        instead: "show fewer pictures in a series",
+        procedure: Box::new(PatternsRun { rig: rig.rig.clone(), calibration: rig.calibration, patterns }),
+    })
+}
+
+impl Measurement for PatternsRun {
+    fn keep(&self, session: &Session) -> Result<(), RpcError> {
+        keep_calibration(self.calibration.as_ref(), session)
+    }
+
+    fn measure(self: Box<Self>, mut run: Run) -> Result<Ended, RunError> {
+        run.note_beginning()?;
+        let Self { rig, patterns, .. } = *self;
+        let task = &patterns.task;
+        let opened = Opened::open(&rig, task, &run)?;
+        let (stack, state) = (run.session.stack()?, run.ledger.state().clone());
+        if let Some(what) = task.unlike(&state) {
+            return Err(RunError::OtherPlan(what));
+        }
+        let missing = missing(task, &state);
+        let again = regular_again(task, &missing, &state);
+        let stages: Arc<[_]> = Arc::new([]);
+        let processing = Processing::without_demux(stages.clone());
+        let planned = task.schedule.points.len();
+        let progress = ProgressMeter::new(&run.orders, planned - missing.len(), planned);
+        let (sink, results) = PointSink::new(task, run, stack, processing, progress);
+        let simulated = opened.pace.of_times();
+        let taken = opened.acquire(stages, UNITS_UNDER_WAY, sink, &results, |passes| {
+            acquire(passes, &patterns, again.into_iter().chain(missing).collect())
+        })?;
+        let Taken { sink: PointSink { run, vsync, write_error, no_light, .. }, exposures, latency, fault } =
+            taken;
+        let Run { session, mut ledger, orders, .. } = run;
+        let no_light = no_light.map(|seen| RunError::NoLight {
+            seen,
+            cause: "the projector stays lit in the dark images too",
+            then: "`raysweep resume` the session",
+        });
+        let fault = write_error.map(RunError::from).or(no_light).or(fault);
+        let state = end_state(fault.as_ref(), &orders);
+        let end = EndEntry {
+            error: fault.map(|fault| fault.to_string()),
+            vsync,
+            light_s: exposures.light_s(),
+            settings_latency: latency,
+            ..end_entry(state, ledger.state().stored_points(), ledger.state().missing_points())
+        };
+        ledger.append(&Entry::End(end.clone()))?;
+        let warnings = match state {
+            EndState::Complete => {
+                let Made { problems, warnings } = make(&session, ledger.state(), &patterns, &rig.file)?;
+                [problems, warnings].concat()
+            }
+            EndState::Cancelled | EndState::Faulted => Vec::new(),
+        };
+        Ok(Ended { end, warnings, found: simulated.into_iter().collect() })
+    }
+}
+
+/// Acquires dark images and the regular one, then all settings of each picture.
+fn acquire(
+    passes: &mut Passes<'_>,
+    patterns: &PatternsTask,
+    wanted: Vec<SettingsId>,
+) -> Result<(), RunError> {
+    let attempts = wanted.into_iter().map(|id| {
+        let point = patterns.task.schedule.points[id.point as usize];
+        passes.attempt_at(id, point)
+    });
+    let mut attempts: Vec<_> = attempts.collect();
+    // The regular image may be taken again by a resumed run, before all others.
+    attempts.sort_by_key(|attempt| attempt.id.point);
+    passes.acquire_under_each(attempts, |attempt| patterns.picture(attempt.id.point))
+}

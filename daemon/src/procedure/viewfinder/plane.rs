@@ -1,0 +1,240 @@
+//! The viewfinder of a plane rig.
+
+use std::time::{Duration, Instant};
+
+use raysweep_config::plan::FinderSubject;
+use raysweep_core::{
+    Camera, CameraCapabilities, DeviceError, DeviceErrorKind, FinderPicture, FrameBuf, FramePool, FrameStamp,
+    Pattern, SettingsId, Subject,
+};
+use raysweep_processing::viewfinder::{AlignPictures, CountScale, FinderTask, SeenRows, pattern_of};
+use raysweep_proto::{RowAlignment, RunState, ViewfinderParams};
+
+use super::finder::{Finder, FinderRig};
+use crate::devices::operator;
+use crate::plane::LitProjector;
+use crate::rig::{Devices, Pace, Rig};
+use crate::run::error::RunError;
+use crate::run::life::Run;
+use crate::run::orders::Orders;
+
+/// Timeout of one wait for a frame, after which orders are looked at.
+const POLL: Duration = Duration::from_millis(50);
+/// A camera without frames for this long lacks its trigger.
+const PATIENCE: Duration = Duration::from_secs(2);
+
+/// Shows pictures until the run is told to end, or the plan's time is over.
+///
+/// # Errors
+/// When a device fails.
+pub fn view(rig: &Rig, task: FinderTask, run: &Run) -> Result<(), RunError> {
+    let Devices { camera, vsync, projector, questions, stand, pace, .. } = run.probes.instead_of(rig.open()?);
+    // Nobody looks at edges.
+    drop(vsync);
+    let projector = LitProjector::new(projector, questions, run)?;
+    let capabilities = camera.capabilities().clone();
+    let geometry = &task.task.geometry;
+    let (found, expected) = ((capabilities.height, capabilities.width), (geometry.height, geometry.width));
+    if found != expected {
+        return Err(RunError::OtherCamera { found, expected });
+    }
+    let scale = CountScale {
+        black_dn: rig.file.camera.black_dn(),
+        saturation_dn: geometry.saturation_dn,
+        full_dn: capabilities.format.max_value(),
+    };
+    let (size, format) = (found, capabilities.format);
+    let seen = FinderRig { size, format, scale, exposure_us: task.exposure_us(), is_dot_rig: false };
+    let finder = Finder::new(run, &task.plan, &seen);
+    let rows = AlignPictures::new(geometry.raster.rows, size);
+    let buffer = FramePool::new(1, format.frame_bytes(size.0 * size.1)).take();
+    let mut viewer = Viewer {
+        orders: &run.orders,
+        task,
+        capabilities,
+        camera,
+        projector,
+        finder,
+        rows,
+        buffer,
+        pace,
+        writes: 0,
+        shown_ns: i64::MIN,
+        first_seq: 0,
+    };
+    let _ = run.board.go(RunState::Armed);
+    let _ = run.board.go(RunState::Running);
+    let subject = viewer.task.plan.subject.map(|subject| match subject {
+        FinderSubject::Scene => Subject::Scene,
+        FinderSubject::Board => Subject::Board,
+    });
+    if let Some(subject) = subject {
+        operator::place(&stand, subject, 0, &run.orders, &run.board)?;
+    }
+    let viewed = viewer.run();
+    let _ = run.board.go(RunState::Draining);
+    viewed
+}
+
+/// The devices of a viewfinder, and how far it is.
+struct Viewer<'a> {
+    orders: &'a Orders,
+    task: FinderTask,
+    capabilities: CameraCapabilities,
+    camera: Box<dyn Camera>,
+    projector: LitProjector,
+    finder: Finder,
+    rows: AlignPictures,
+    buffer: FrameBuf,
+    pace: Pace,
+    /// How often settings were written.
+    writes: u32,
+    /// Exposures that begin earlier may see the picture before.
+    shown_ns: i64,
+    /// Earlier frames may have the settings before.
+    first_seq: u64,
+}
+
+impl Viewer<'_> {
+    fn run(&mut self) -> Result<(), RunError> {
+        self.expose()?;
+        self.camera.arm()?;
+        self.light()?;
+        let viewed = self.frames();
+        if let Err(error) = self.camera.disarm() {
+            tracing::warn!(%error, "camera not disarmed");
+        }
+        viewed
+    }
+
+    fn frames(&mut self) -> Result<(), RunError> {
+        let mut waiting = Instant::now();
+        while self.orders.go_on() && !self.finder.is_over() {
+            self.orders.wait_while_paused();
+            self.change()?;
+            match self.camera.next_frame(&mut self.buffer, POLL)? {
+                Some(stamp) => {
+                    waiting = Instant::now();
+                    self.frame(&stamp)?;
+                }
+                None if waiting.elapsed() > PATIENCE => self.finder.complain(
+                    "no frame for 2 s: the camera gets no trigger; check that the projector is on, and that its VSYNC line reaches the camera",
+                ),
+                None => {}
+            }
+        }
+        Ok(())
+    }
+
+    /// Makes the changes that clients want.
+    fn change(&mut self) -> Result<(), RunError> {
+        if !self.orders.look.is_changed() {
+            return Ok(());
+        }
+        let wanted = self.orders.look.take();
+        self.finder.change(&wanted);
+        let ViewfinderParams { picture, exposure_us, .. } = wanted;
+        if exposure_us.is_some() {
+            self.expose()?;
+        }
+        if picture.is_some() {
+            self.rows.restart();
+            self.light()?;
+        }
+        Ok(())
+    }
+
+    /// Writes the exposure.
+    fn expose(&mut self) -> Result<(), RunError> {
+        let settings = self.task.settings(self.finder.exposure_us(), self.capabilities.trigger_latency_us);
+        let applied = self.camera.configure(SettingsId { point: 0, attempt: self.writes }, &settings);
+        self.writes += 1;
+        match applied {
+            Ok(applied) => self.first_seq = applied.first_frame.certain(),
+            Err(error) if error.kind == DeviceErrorKind::OutOfRange => {
+                self.finder.complain(error.to_string())
+            }
+            Err(error) => return Err(error.into()),
+        }
+        Ok(())
+    }
+
+    /// Shows the picture, or the next one of a series.
+    fn light(&mut self) -> Result<(), RunError> {
+        let pattern = match self.finder.picture() {
+            FinderPicture::Align => Some(self.rows.next().clone()),
+            picture => pattern_of(picture),
+        };
+        match self.projector.show(pattern.as_ref(), self.orders) {
+            Ok(Some(shown)) => self.shown_ns = shown.not_before_ns,
+            // The run was ended while an operator was asked.
+            Ok(None) => {}
+            Err(error) if is_refused(&error) => self.refused(pattern.as_ref(), &error)?,
+            Err(error) => return Err(error.into()),
+        }
+        Ok(())
+    }
+
+    /// Goes on without light where a picture cannot be shown.
+    fn refused(&mut self, pattern: Option<&Pattern>, error: &DeviceError) -> Result<(), RunError> {
+        let what = pattern.map_or_else(String::new, |pattern| format!("cannot show {pattern}: "));
+        self.finder.change(&ViewfinderParams { picture: Some(FinderPicture::Black), ..Default::default() });
+        if let Some(shown) = self.projector.show(None, self.orders)? {
+            self.shown_ns = shown.not_before_ns;
+        }
+        self.finder.complain(format!("{what}{error}"));
+        Ok(())
+    }
+
+    /// Shows a frame, if it is new and due.
+    fn frame(&mut self, stamp: &FrameStamp) -> Result<(), RunError> {
+        if stamp.seq < self.first_seq || stamp.exposure_start_ns < self.shown_ns {
+            return Ok(());
+        }
+        let is_align = self.finder.picture() == FinderPicture::Align;
+        if !is_align && self.pace == Pace::Devices && self.finder.time_to_next() > Duration::ZERO {
+            return Ok(());
+        }
+        let image = self.finder.unpack(&self.buffer).map_err(RunError::Frame)?;
+        if is_align {
+            let like_the_subject = self.rows.next_is_white();
+            if let Some(rows) = self.rows.add(image) {
+                let geometry = &self.task.task.geometry;
+                let alignment = match rows {
+                    Ok(rows) => aligned(&rows, geometry.first_row, geometry.row_pitch),
+                    Err(error) => Err(error.to_string()),
+                };
+                self.finder.align(alignment);
+            }
+            self.light()?;
+            if !like_the_subject {
+                return Ok(());
+            }
+        }
+        self.finder.show();
+        if self.pace == Pace::Pipeline {
+            self.orders.rest(self.finder.time_to_next());
+        }
+        Ok(())
+    }
+}
+
+/// How the rows lie, and what to turn.
+fn aligned(rows: &SeenRows, first_row: usize, row_pitch: f64) -> Result<RowAlignment, String> {
+    let found = rows.alignment(first_row, row_pitch).ok_or_else(|| {
+        "too few pixels see the projector's rows: fill the view with a white board".to_owned()
+    })?;
+    Ok(RowAlignment {
+        measured: 0,
+        shift_rows: found.shift_rows,
+        rotation_deg: found.rotation_deg,
+        magnification: found.magnification,
+        worst_rows: found.worst_rows,
+        residual_rows: found.residual_rows,
+        advice: found.advice(rows.place.dim(), first_row, row_pitch),
+    })
+}
+
+fn is_refused(error: &DeviceError) -> bool {
+    matches!(error.kind, DeviceErrorKind::OutOfRange | DeviceErrorKind::Unsupported)
+}

@@ -1,0 +1,211 @@
+//! `raysweep doctor` on the simulated GigE camera and on simulated boxes at pseudo-terminals: what is sound is found
+//! sound, and each fault is named with what mends it.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on may panic")]
+
+mod process;
+mod wire_rig;
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+use process::{Process, wait_for};
+use raysweep::doctor;
+use raysweep::rig::AnyRig;
+use raysweep_proto::{
+    Client, DoctorCheck, DoctorParams, DoctorReport, ErrorCode, Grade, RunParams, RunState,
+};
+use raysweep_sim::mirror::{MirrorPty, PlayzerXController, PlayzerXControllerConfig, SerialLink, WireFaults};
+use raysweep_sim::triggerbox::TriggerBoxPty;
+use wire_rig::WireRig;
+
+fn rig_text(camera: &str, sim: &str) -> String {
+    format!(
+        "kind = \"plane\"\n[camera]\npixel_format = \"Mono12p\"\ndriver = \"aravis\"\naravis.address = \"127.0.0.1\"\n\
+         aravis.trigger_latency_us = 8\n{camera}\n[vsync]\ndriver = \"sim\"\n[projector]\ndriver = \"sim\"\nrows = 32\n\
+         row_time_us = 22.22\nfirst_row_us = 2200\n[sim]\nbench = \"bench.sock\"\nscene = \"v-groove\"\n\
+         scene_rows = 32\nscene_columns = 32\n{sim}"
+    )
+}
+
+/// What `raysweep doctor --rig` finds.
+fn examined(rig: &WireRig) -> DoctorReport {
+    let (report, code) = by_hand(&rig.path("rig.toml"), &rig.path("data"));
+    assert_eq!(code == Some(1), report.worst() == Grade::Failure, "{report:#?}");
+    report
+}
+
+fn by_hand(rig: &Path, data: &Path) -> (DoctorReport, Option<i32>) {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_raysweep"));
+    let output =
+        command.args(["--json", "doctor", "--rig"]).arg(rig).arg("--data").arg(data).output().unwrap();
+    let error = String::from_utf8_lossy(&output.stderr);
+    (serde_json::from_slice(&output.stdout).expect(&error), output.status.code())
+}
+
+fn check<'a>(report: &'a DoctorReport, name: &str) -> &'a DoctorCheck {
+    report.checks.iter().find(|check| check.name == name).unwrap_or_else(|| panic!("{name}: {report:#?}"))
+}
+
+/// The only checks that are wrong are the named ones.
+fn assert_wrong(report: &DoctorReport, wrong: &[(&str, Grade)]) {
+    // What the machine of the test is like.
+    const OF_THE_HOST: [&str; 6] =
+        ["real-time priority", "clock source", "memory", "service", "network buffers", "camera search"];
+    let found: Vec<(&str, Grade)> = report
+        .checks
+        .iter()
+        .filter(|check| check.grade > Grade::Skipped && !OF_THE_HOST.contains(&check.name.as_str()))
+        .map(|check| (check.name.as_str(), check.grade))
+        .collect();
+    assert_eq!(found, wrong, "{report:#?}");
+    assert!(report.checks.iter().all(|check| (check.grade > Grade::Skipped) == check.remedy.is_some()));
+}
+
+#[test]
+fn a_sound_rig_on_the_wire_is_found_sound_by_the_daemon_and_runs_afterwards() {
+    let rig = WireRig::start(&rig_text("", ""), &[], 9000);
+    let socket = rig.path("socket");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_raysweepd"));
+    command.arg("--rig").arg(rig.path("rig.toml")).arg("--socket").arg(&socket);
+    let _daemon = Process::start(command.arg("--data").arg(rig.path("data")).stderr(Stdio::null()));
+    let mut client = wait_for("the daemon does not listen", || Client::connect(&socket).ok());
+    let plan = "kind = \"sweep\"\n[sweep]\naverage = 1\ndelay_us = [0, 100]\nexposure_us = [400]\n";
+    let report = client.doctor(&DoctorParams { plan: Some(plan.into()) }).unwrap();
+    assert_wrong(&report, &[]);
+    assert!(check(&report, "disk").found.contains("the plan needs"), "{report:#?}");
+    assert!(check(&report, "frames").found.contains("80 arrived"), "{report:#?}");
+    assert_eq!(client.status().unwrap().state, RunState::Idle);
+
+    let invalid = client.doctor(&DoctorParams { plan: Some("kind = \"swep\"".into()) }).unwrap_err();
+    assert!(invalid.to_string().contains("sweep"), "{invalid}");
+    let paused = plan.replace("average = 1", "average = 200");
+    client.run(&RunParams { plan: paused, ..RunParams::default() }).unwrap();
+    let refused = client.doctor(&DoctorParams::default()).unwrap_err();
+    let raysweep_proto::ClientError::Rpc(refused) = refused else { panic!("{refused}") };
+    assert_eq!(refused.name(), Some(ErrorCode::Busy));
+    client.cancel().unwrap();
+}
+
+#[test]
+fn a_camera_without_a_trigger_is_told_from_a_line_without_edges() {
+    let rig = WireRig::start(&rig_text("aravis.trigger_source = \"Software\"", ""), &[], 9000);
+    let report = examined(&rig);
+    assert_wrong(&report, &[("frames", Grade::Failure)]);
+    let remedy = check(&report, "frames").remedy.as_ref().unwrap();
+    assert!(remedy.contains("trigger_source") && remedy.contains("Software"), "{remedy}");
+}
+
+#[test]
+fn frames_whose_stamps_mean_something_else_have_no_edge() {
+    let rig = WireRig::start(&rig_text("aravis.timestamp_at = \"exposure_end\"", ""), &[], 9000);
+    let report = examined(&rig);
+    assert_wrong(&report, &[("frames and edges", Grade::Failure)]);
+    let ties = check(&report, "frames and edges");
+    assert!(ties.found.contains("0 of"), "{ties:?}");
+    assert!(ties.remedy.as_ref().unwrap().contains("timestamp_at"), "{ties:?}");
+}
+
+#[test]
+fn lost_packets_are_named() {
+    let rig = WireRig::start(&rig_text("", ""), &["packet_loss=0.1", "resend=false"], 1500);
+    let report = examined(&rig);
+    let frames = check(&report, "frames");
+    assert_eq!(frames.grade, Grade::Warning, "{report:#?}");
+    assert!(frames.found.contains("packets lost"), "{frames:?}");
+}
+
+#[test]
+fn packets_larger_than_the_network_carries_are_named() {
+    let rig = WireRig::start(&rig_text("aravis.packet_size = 9000", ""), &[], 1500);
+    let size = check(&examined(&rig), "packet size").clone();
+    assert_eq!(size.grade, Grade::Failure, "{size:?}");
+    assert!(size.remedy.unwrap().contains("ip link set lo mtu 9000"));
+}
+
+#[test]
+fn a_jittering_line_is_named() {
+    let rig = WireRig::start(&rig_text("", "[sim.vsync]\njitter_us = 60\n"), &[], 9000);
+    let report = examined(&rig);
+    assert_eq!(check(&report, "vsync edges").grade, Grade::Warning, "{report:#?}");
+}
+
+/// What is found on a simulated rig without a wire.
+fn simulated(text: &str) -> DoctorReport {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("rig.toml");
+    fs::write(&path, text).unwrap();
+    let rig = AnyRig::load(&path).unwrap();
+    doctor::examine(&rig.into(), &folder.path().join("data"), None, &|| true)
+}
+
+fn simulated_with(vsync: &str, sim: &str) -> DoctorReport {
+    simulated(&format!(
+        "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver = \"sim\"\n{vsync}\n[projector]\ndriver = \"sim\"\n\
+         [sim]\nscene_rows = 8\nscene_columns = 8\n{sim}"
+    ))
+}
+
+#[test]
+fn faults_of_line_and_camera_are_named() {
+    use Grade::{Failure, Warning};
+    assert_wrong(&simulated_with("", ""), &[]);
+    let silent = simulated_with("", "[sim.vsync]\nmissing = 1\n");
+    assert_wrong(&silent, &[("vsync edges", Failure), ("frames", Failure)]);
+    assert!(check(&silent, "frames").remedy.as_ref().unwrap().contains("no edges either"));
+    let crosstalk = simulated_with("", "[sim.vsync]\nfalse_edges = 0.2\n");
+    assert_wrong(&crosstalk, &[("vsync edges", Warning), ("frames and edges", Warning)]);
+    assert_wrong(&simulated_with("", "[sim.vsync]\nunseen = 0.1\n"), &[("vsync edges", Warning)]);
+    assert_wrong(&simulated_with("", "[sim.camera]\ndropped = 0.2\n"), &[("frames", Warning)]);
+    // A projector at 50 Hz.
+    let other = simulated_with("period_us = 20000", "");
+    assert_wrong(&other, &[]);
+}
+
+fn triggerbox_rig(port: &Path) -> String {
+    format!(
+        "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver = \"triggerbox\"\n\
+         triggerbox = {{ port = \"{}\", link = \"usb\" }}\n[projector]\ndriver = \"external\"\n\
+         [sim]\nrealtime = true\nscene_rows = 8\nscene_columns = 8\n",
+        port.display()
+    )
+}
+
+#[test]
+fn a_triggerbox_is_watched_and_a_port_that_another_program_has_open_is_named() {
+    let link = SerialLink::VirtualCom;
+    let pty = TriggerBoxPty::plug(16_666_667, link, WireFaults::default()).unwrap();
+    let report = simulated(&triggerbox_rig(pty.path()));
+    assert_eq!(check(&report, "vsync").grade, Grade::Ok, "{report:#?}");
+    assert_eq!(check(&report, "vsync edges").grade, Grade::Ok, "{report:#?}");
+    let held = fs::File::options().read(true).write(true).open(pty.path()).unwrap();
+    held.try_lock().unwrap();
+    let busy = simulated(&triggerbox_rig(pty.path()));
+    let vsync = check(&busy, "vsync");
+    assert_eq!(vsync.grade, Grade::Failure, "{busy:#?}");
+    assert!(vsync.remedy.as_ref().unwrap().contains("fuser"), "{vsync:?}");
+}
+
+#[test]
+fn a_mirror_answers_in_darkness_and_unmoved() {
+    let controller = PlayzerXController::new(PlayzerXControllerConfig::default());
+    let pty = MirrorPty::plug(controller, SerialLink::VirtualCom, WireFaults::default()).unwrap();
+    let rig = |port: &Path| {
+        format!(
+            "kind = \"dots\"\n[camera]\ndriver = \"sim\"\n[mirror]\ndriver = \"playzerx\"\nport = \"{}\"\n\
+             [sim.dots]\nrows = 16\ncolumns = 32\n",
+            port.display()
+        )
+    };
+    let report = simulated(&rig(pty.path()));
+    assert_wrong(&report, &[("light", Grade::Warning)]);
+    assert!(check(&report, "mirror").found.contains("not moved"), "{report:#?}");
+    let truth = pty.truth();
+    assert!(truth.held.iter().all(|held| held.x == 0.0 && held.y == 0.0 && held.light == 0), "it moved");
+    let missing = simulated(&rig(Path::new("/dev/nowhere")));
+    assert_wrong(
+        &missing,
+        &[("mirror.port", Grade::Failure), ("mirror", Grade::Failure), ("light", Grade::Warning)],
+    );
+}

@@ -1,0 +1,166 @@
+//! `raysweep setup`: answers become a rig file that `doctor` finds sound and that runs the paper's sweep.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on may panic")]
+
+mod process;
+mod wire_rig;
+
+use std::fs::{self, File};
+use std::io::{Read, Write};
+use std::os::fd::OwnedFd;
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+
+use nix::pty::openpty;
+use process::{Process, wait_for};
+use raysweep_proto::{Client, DoctorReport, Event, Grade, RunParams};
+use raysweep_sim::mirror::{MirrorPty, PlayzerXController, PlayzerXControllerConfig, SerialLink, WireFaults};
+use raysweep_sim::triggerbox::TriggerBoxPty;
+use serde_json::Value;
+use wire_rig::WireRig;
+
+/// Runs `setup` in a folder with these answers.
+fn setup(folder: &Path, answers: &str) -> Output {
+    fs::write(folder.join("answers.toml"), answers).unwrap();
+    let mut command = Command::new(env!("CARGO_BIN_EXE_raysweep"));
+    command.args(["--json", "setup", "--answers", "answers.toml", "--rig", "new-rig.toml"]);
+    command.current_dir(folder).stdin(Stdio::null()).output().unwrap()
+}
+
+fn written(output: &Output) -> Value {
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+/// What `doctor` finds of the rig that was set up.
+fn examined(folder: &Path) -> DoctorReport {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_raysweep"));
+    command.args(["--json", "doctor", "--rig", "new-rig.toml", "--data", "data"]);
+    let output = command.current_dir(folder).output().unwrap();
+    serde_json::from_slice(&output.stdout)
+        .unwrap_or_else(|error| panic!("{error}: {}", String::from_utf8_lossy(&output.stderr)))
+}
+
+fn failures(report: &DoctorReport) -> Vec<&str> {
+    let failed = report.checks.iter().filter(|check| check.grade == Grade::Failure);
+    failed.map(|check| check.name.as_str()).collect()
+}
+
+const BENCH: &str = "kind = \"plane\"\n[camera]\ndriver = \"aravis\"\naravis.address = \"127.0.0.1\"\n[vsync]\ndriver = \"sim\"\n\
+    [projector]\ndriver = \"sim\"\nrows = 64\nrow_time_us = 22.22\nfirst_row_us = 2200\n[sim]\nbench = \"bench.sock\"\n\
+    scene = \"v-groove\"\nscene_rows = 64\nscene_columns = 64\n";
+
+#[test]
+fn a_rig_set_up_from_answers_is_sound_and_runs_the_papers_sweep() {
+    let rig = WireRig::start(BENCH, &[], 9000);
+    let folder = rig.path("");
+    let answers = "kind = 'plane'\nprojector_rows = 64\nrow_time_us = 22.22\nfirst_row_us = 2200\ncamera = 'genicam:127.0.0.1'\n\
+        trigger_latency_us = 8\nprojector = 'bench'\nvsync = 'bench'\nscene_rows = 64\n";
+    let output = setup(&folder, answers);
+    assert_eq!(written(&output)["rig"], "new-rig.toml");
+    let text = fs::read_to_string(rig.path("new-rig.toml")).unwrap();
+    assert!(
+        text.contains("pixel_format = \"Mono12p\"") && text.contains("trigger_source = \"Line0\""),
+        "{text}"
+    );
+    let report = examined(&folder);
+    assert!(failures(&report).is_empty(), "{report:#?}");
+
+    let socket = rig.path("socket");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_raysweepd"));
+    command.arg("--rig").arg(rig.path("new-rig.toml")).arg("--socket").arg(&socket);
+    let _daemon = Process::start(command.arg("--data").arg(rig.path("data")).stderr(Stdio::null()));
+    let mut client = wait_for("the daemon does not listen", || Client::connect(&socket).ok());
+    let events = Client::connect(&socket).unwrap().subscribe().unwrap();
+    let plan = include_str!("../../deploy/plans/paper.toml");
+    client.run(&RunParams { plan: plan.into(), ..RunParams::default() }).unwrap();
+    let ended = events.into_iter().find_map(|event| match event.unwrap() {
+        Event::Finished { state, missing, error, .. } => Some((state, missing, error)),
+        _ => None,
+    });
+    assert_eq!(ended, Some(("complete".into(), 0, None)));
+}
+
+#[test]
+fn ports_that_may_be_asked_say_what_they_are_and_a_dot_rig_is_found_sound() {
+    let folder = tempfile::tempdir().unwrap();
+    let link = SerialLink::VirtualCom;
+    let controller = PlayzerXController::new(PlayzerXControllerConfig::default());
+    let mirror = MirrorPty::plug(controller, link, WireFaults::default()).unwrap();
+    let trigger = TriggerBoxPty::plug(16_666_667, link, WireFaults::default()).unwrap();
+    let (mirror_port, trigger_port) = (mirror.path().display(), trigger.path().display());
+    let answers = format!(
+        "kind = 'dots'\ncamera = 'sim'\nask_ports = ['{mirror_port}', '{trigger_port}']\nmirror = 'playzerx:{mirror_port}'\n"
+    );
+    let value = written(&setup(folder.path(), &answers));
+    let answering = &value["connected"]["answering"];
+    assert!(answering[0][1]["playzerx"].is_string() && answering[1][1]["triggerbox"].is_u64(), "{answering}");
+    let report = examined(folder.path());
+    assert!(failures(&report).is_empty(), "{report:#?}");
+    assert!(report.checks.iter().any(|check| check.name == "mirror" && check.found.contains("not moved")));
+    let held = mirror.truth().held;
+    assert!(
+        held.iter().all(|held| held.x == 0.0 && held.y == 0.0 && held.light == 0),
+        "setup moved the mirror"
+    );
+
+    let folder = tempfile::tempdir().unwrap();
+    let answers = format!(
+        "camera = 'sim'\nprojector = 'external'\nvsync = 'triggerbox:{trigger_port}'\ntriggerbox_link = 'usb'\n"
+    );
+    written(&setup(folder.path(), &answers));
+    let report = examined(folder.path());
+    assert!(failures(&report).is_empty(), "{report:#?}");
+}
+
+#[test]
+fn wrong_answers_write_nothing_and_name_what_is_allowed() {
+    let folder = tempfile::tempdir().unwrap();
+    for (answers, part) in [
+        ("camera = 'sim'\nvsync = 'wire'\nprojector = 'sim'", "vsync = \"wire\"; allowed: "),
+        ("camera = 'sim'\nprojector = 'sim'\nvsync = 'sim'\nprojector_rows = 0", "allowed: 1 to 8192"),
+        ("camera = 'sim'\nprojector = 'sim'\nvsync = 'sim'\nmirror = 'sim'", "mirror: not asked for"),
+        ("camera = 'sim'\nprojector = 'sim'\nvsync = 'sim'\nrow_time_us = 900", "do not go together"),
+        ("camera = 'sim'\nprojector = 'sim'\nvsync = 'sim'\nprojector_rows = 1.5", "whole numbers"),
+        ("camera = ", "answers.toml"),
+        ("kind = 'dots'\ncamera = 'sim'\nmirror = 'optotune:/dev/null'", "laser_port is missing"),
+    ] {
+        let output = setup(folder.path(), answers);
+        let error: Value = serde_json::from_slice(&output.stdout).unwrap();
+        let error = error["error"]["message"].as_str().unwrap_or_else(|| panic!("{error}")).to_owned();
+        assert_eq!(output.status.code(), Some(2), "{answers}: {error}");
+        assert!(error.contains(part), "{answers}: {error}");
+        assert!(!folder.path().join("new-rig.toml").exists(), "{answers}");
+    }
+    let sound = "camera = 'sim'\nprojector = 'sim'\nvsync = 'sim'";
+    fs::write(folder.path().join("new-rig.toml"), "mine").unwrap();
+    let output = setup(folder.path(), sound);
+    assert!(String::from_utf8_lossy(&output.stdout).contains("--force"));
+    assert_eq!(fs::read_to_string(folder.path().join("new-rig.toml")).unwrap(), "mine");
+    let mut nobody = Command::new(env!("CARGO_BIN_EXE_raysweep"));
+    let output = nobody.arg("setup").current_dir(folder.path()).stdin(Stdio::null()).output().unwrap();
+    assert!(String::from_utf8_lossy(&output.stderr).contains("--answers"));
+}
+
+#[test]
+fn a_person_who_takes_every_default_gets_a_rig_that_can_be_rehearsed() {
+    let folder = tempfile::tempdir().unwrap();
+    let pty = openpty(None, None).unwrap();
+    let slave = |end: &OwnedFd| Stdio::from(end.try_clone().unwrap());
+    let mut command = Command::new(env!("CARGO_BIN_EXE_raysweep"));
+    command.args(["setup", "--rig", "new-rig.toml"]).current_dir(folder.path());
+    let mut process =
+        Process::start(command.stdin(slave(&pty.slave)).stdout(slave(&pty.slave)).stderr(slave(&pty.slave)));
+    // The terminal ends when the process has ended and nobody here holds its end.
+    drop((command, pty.slave));
+    let mut person = File::from(pty.master);
+    // No camera, and nothing else, but the simulated one, wherever this machine has none.
+    person.write_all(b"\n\n\n\nsim\nsim\nsim\n\n\n\n\n").unwrap();
+    let mut said = Vec::new();
+    // It ends in an error.
+    let _ = person.read_to_end(&mut said);
+    let said = String::from_utf8_lossy(&said);
+    assert!(process.wait().success(), "{said}");
+    assert!(said.contains("connected:") && said.contains("next: `raysweep doctor"), "{said}");
+    assert!(failures(&examined(folder.path())).is_empty());
+}

@@ -1,0 +1,287 @@
+//! `raysweep view` with the real daemon: who is let in, that browsers cost a run nothing, and the page in a real browser.
+
+#![cfg(feature = "view")]
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+
+mod process;
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::TcpStream;
+use std::os::unix::fs::PermissionsExt;
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
+
+use nix::unistd::Uid;
+use raysweep_proto::Client;
+use serde_json::{Value, json};
+
+use self::process::Process;
+
+const RIG: &str = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver = \"sim\"\n[projector]\ndriver = \"sim\"\n\
+                   [sim]\nscene = \"v-groove\"\nscene_rows = 48\nscene_columns = 32\nseed = 1\n";
+const SWEEP: &str = "kind = \"sweep\"\nname = \"groove\"\n[sweep]\naverage = 4\n\
+                     delay_us = { start = -900, stop = 900, count = 13 }\nexposure_us = [400, 800]\n";
+const FILM: &str = "kind = \"film\"\nname = \"film\"\n[film]\ncycles = 12\n";
+/// Nobody: a user who is no operator.
+const OBSERVER: u32 = 65534;
+const PATIENCE: Duration = Duration::from_secs(120);
+
+struct Lab {
+    folder: tempfile::TempDir,
+    _daemon: Process,
+}
+
+impl Lab {
+    fn start() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        fs::set_permissions(folder.path(), fs::Permissions::from_mode(0o755)).unwrap();
+        fs::write(folder.path().join("rig.toml"), RIG).unwrap();
+        let daemon = Process::start(
+            Command::new(env!("CARGO_BIN_EXE_raysweepd"))
+                .current_dir(folder.path())
+                .args(["--rig", "rig.toml", "--data", "data", "--socket", "socket"])
+                .stderr(Stdio::null()),
+        );
+        let lab = Self { folder, _daemon: daemon };
+        let since = Instant::now();
+        while Client::connect(lab.socket()).is_err() {
+            assert!(since.elapsed() < PATIENCE, "the daemon does not listen");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        lab
+    }
+
+    fn socket(&self) -> PathBuf {
+        self.folder.path().join("socket")
+    }
+
+    fn view(&self, uid: Option<u32>) -> Page {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_raysweep"));
+        command.arg("view").arg("--json").arg("--socket").arg(self.socket()).stdout(Stdio::piped());
+        if let Some(uid) = uid {
+            command.uid(uid);
+        }
+        let (process, output) = Process::with_output(&mut command);
+        let mut line = String::new();
+        BufReader::new(output).read_line(&mut line).unwrap();
+        let told: Value = serde_json::from_str(&line).unwrap();
+        let address = told["address"].as_str().unwrap().to_owned();
+        let (host, path) = address.strip_prefix("http://").unwrap().split_once('/').unwrap();
+        Page { _view: process, host: host.into(), path: format!("/{path}"), address: address.clone() }
+    }
+
+    /// Runs a plan to its end; returns its session.
+    fn run(&self, plan: &str) -> PathBuf {
+        let output = Command::new(env!("CARGO_BIN_EXE_raysweep"))
+            .args(["run", "--json", "--socket"])
+            .arg(self.socket())
+            .arg(self.write_plan(plan))
+            .stderr(Stdio::null())
+            .output()
+            .unwrap();
+        assert!(output.status.success(), "{output:?}");
+        let text = String::from_utf8(output.stdout).unwrap();
+        let end: Value = serde_json::from_str(text.lines().last().unwrap()).unwrap();
+        assert_eq!((&end["state"], &end["missing"]), (&json!("complete"), &json!(0)), "{end}");
+        end["session"].as_str().unwrap().into()
+    }
+
+    fn write_plan(&self, plan: &str) -> PathBuf {
+        let path = self.folder.path().join("plan.toml");
+        fs::write(&path, plan).unwrap();
+        path
+    }
+}
+
+/// A running view.
+struct Page {
+    _view: Process,
+    host: String,
+    path: String,
+    address: String,
+}
+
+impl Page {
+    /// Sends a request; returns status, head and body.
+    fn request(
+        &self,
+        method: &str,
+        path: &str,
+        headers: &[(&str, &str)],
+        body: &str,
+    ) -> (u16, String, Vec<u8>) {
+        let mut stream = TcpStream::connect(&self.host).unwrap();
+        let has_host = headers.iter().any(|(name, _)| *name == "Host");
+        let mut head =
+            format!("{method} {path} HTTP/1.1\r\nConnection: close\r\nContent-Length: {}\r\n", body.len());
+        if !has_host {
+            head.push_str(&format!("Host: {}\r\n", self.host));
+        }
+        headers.iter().for_each(|(name, value)| head.push_str(&format!("{name}: {value}\r\n")));
+        stream.write_all(format!("{head}\r\n{body}").as_bytes()).unwrap();
+        let mut answer = Vec::new();
+        stream.read_to_end(&mut answer).unwrap();
+        let end = answer.windows(4).position(|four| four == b"\r\n\r\n").unwrap();
+        let head = String::from_utf8(answer[..end].to_vec()).unwrap();
+        let status = head.split(' ').nth(1).unwrap().parse().unwrap();
+        (status, head.to_lowercase(), answer[end + 4..].to_vec())
+    }
+
+    fn get(&self, rest: &str) -> (u16, String, Vec<u8>) {
+        self.request("GET", &format!("{}{rest}", self.path), &[], "")
+    }
+
+    fn call(&self, method: &str, params: Value) -> Value {
+        let body = json!({ "method": method, "params": params }).to_string();
+        let (status, _, answer) = self.request("POST", &format!("{}call", self.path), &[], &body);
+        assert_eq!(status, 200, "{}", String::from_utf8_lossy(&answer));
+        serde_json::from_slice(&answer).unwrap()
+    }
+}
+
+#[test]
+fn only_the_page_itself_is_let_in_and_only_with_its_users_rights() {
+    let lab = Lab::start();
+    let page = lab.view(None);
+    let (status, head, body) = page.get("");
+    assert_eq!(status, 200);
+    assert!(head.contains("content-security-policy: default-src 'none'; script-src 'self'"), "{head}");
+    assert!(String::from_utf8(body).unwrap().contains("<title>raysweep</title>"));
+
+    let call = json!({ "method": "status" }).to_string();
+    let to_call = format!("{}call", page.path);
+    let wrong_token = page.path.replace(|digit: char| digit.is_ascii_hexdigit(), "0");
+    for (path, headers) in [
+        ("/", &[][..]),
+        ("/call", &[]),
+        (&wrong_token, &[]),
+        (&to_call, &[("Host", "rig.example.org")]),
+        (&to_call, &[("Origin", "http://example.org")]),
+        (&to_call, &[("Origin", "null")]),
+    ] {
+        let (status, _, body) = page.request("POST", path, headers, &call);
+        let text = String::from_utf8_lossy(&body).into_owned();
+        assert_eq!(status, 403, "{path} {headers:?}: {text}");
+        assert!(!text.contains("version"), "{text}");
+    }
+    // Not what the page has a button for, and not a call.
+    for body in ["{\"method\": \"arm_light\"}", "{\"method\": \"subscribe\"}"] {
+        assert_eq!(page.request("POST", &to_call, &[], body).0, 403, "{body}");
+    }
+    for body in ["", "[]", "{\"method\": 1}", "{\"method\": \"status\", \"more\": 1}"] {
+        assert_eq!(page.request("POST", &to_call, &[], body).0, 400, "{body}");
+    }
+    // Only sessions that the daemon lists, and of them only pictures.
+    for path in ["session/..", "session/%2Fetc", "session/x/report", "session/..%2F..%2Fetc/picture/passwd"] {
+        assert_eq!(page.get(path).0, 404, "{path}");
+    }
+    assert_eq!(page.call("status", json!({}))["result"]["role"], "operator");
+    let refused = page.call("run", json!({ "plan": "kind = \"sweep\"\n[sweep]\ndelay_us = []" }));
+    assert_eq!(refused["error"]["data"]["name"], "invalid_plan", "{refused}");
+
+    // Only root can start a process of another user.
+    if Uid::effective().is_root() {
+        let page = lab.view(Some(OBSERVER));
+        assert_eq!(page.call("status", json!({}))["result"]["role"], "observer");
+        for method in ["run", "pause", "continue", "cancel"] {
+            let params = if method == "run" { json!({ "plan": SWEEP }) } else { json!({}) };
+            assert_eq!(page.call(method, params)["error"]["data"]["name"], "forbidden", "{method}");
+        }
+    }
+}
+
+/// All files below a folder of a session.
+fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut files = BTreeMap::new();
+    let mut folders = vec![folder.to_owned()];
+    while let Some(next) = folders.pop() {
+        for entry in fs::read_dir(next).unwrap() {
+            let path = entry.unwrap().path();
+            match path.is_dir() {
+                true => folders.push(path),
+                false => {
+                    files.insert(path.strip_prefix(folder).unwrap().to_owned(), fs::read(&path).unwrap());
+                }
+            }
+        }
+    }
+    files
+}
+
+#[test]
+fn ten_browsers_cost_a_sweep_and_a_film_no_frame_and_no_bit() {
+    const BROWSERS: usize = 10;
+    let lab = Lab::start();
+    let alone: Vec<PathBuf> = [SWEEP, FILM].map(|plan| lab.run(plan)).into();
+    let page = Arc::new(lab.view(None));
+    let (stop, pictures) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicUsize::new(0)));
+    // The stream of events stays open, as a browser's does.
+    let streams: Vec<TcpStream> = (0..BROWSERS)
+        .map(|_| {
+            let mut stream = TcpStream::connect(&page.host).unwrap();
+            let head = format!("GET {}events HTTP/1.1\r\nHost: {}\r\n\r\n", page.path, page.host);
+            stream.write_all(head.as_bytes()).unwrap();
+            stream.set_read_timeout(Some(PATIENCE)).unwrap();
+            stream
+        })
+        .collect();
+    let browsers: Vec<_> = (0..BROWSERS)
+        .map(|browser| {
+            let (page, stop, pictures) = (page.clone(), stop.clone(), pictures.clone());
+            std::thread::spawn(move || {
+                while !stop.load(Ordering::Relaxed) {
+                    let name = ["epipolar", "indirect", "total"][browser % 3];
+                    let (status, _, body) = page.get(&format!("live/{name}"));
+                    pictures
+                        .fetch_add(usize::from(status == 200 && body.len() > 2 * 48 * 32), Ordering::Relaxed);
+                    page.call("status", json!({}));
+                }
+            })
+        })
+        .collect();
+    let watched: Vec<PathBuf> = [SWEEP, FILM].map(|plan| lab.run(plan)).into();
+    stop.store(true, Ordering::Relaxed);
+    browsers.into_iter().for_each(|browser| browser.join().unwrap());
+    assert!(pictures.load(Ordering::Relaxed) >= BROWSERS, "{pictures:?} pictures were seen");
+    for (stream, mut text) in streams.into_iter().map(|stream| (stream, String::new())) {
+        let mut lines = BufReader::new(stream);
+        // Each stream tells of both ends.
+        for _ in 0..2 {
+            while !text.contains("\"event\":\"finished\"") {
+                text.clear();
+                assert!(lines.read_line(&mut text).unwrap() > 0, "the stream of events has ended");
+            }
+            text.clear();
+        }
+    }
+    for ((alone, watched), array) in alone.iter().zip(&watched).zip(["stack.zarr", "film.zarr"]) {
+        let (alone, watched) = (files(&alone.join(array)), files(&watched.join(array)));
+        assert!(alone.len() > 2 && alone == watched, "{array} differs");
+    }
+}
+
+/// A run is checked, started, watched, paused, finished; its report is opened; two sessions are compared.
+#[test]
+fn the_page_works_in_a_real_browser() {
+    let python = std::env::var("RAYSWEEP_PYTHON").expect(
+        "RAYSWEEP_PYTHON names a Python with tests/python/requirements.txt: `cargo xtask test` makes one",
+    );
+    let lab = Lab::start();
+    let page = lab.view(None);
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/python/view_page.py");
+    let mut command = Command::new(python);
+    command.arg(script).arg(&page.address).arg(lab.write_plan(SWEEP));
+    // To look at them: RAYSWEEP_SCREENSHOTS=FOLDER.
+    if let Some(folder) = std::env::var_os("RAYSWEEP_SCREENSHOTS") {
+        command.arg(folder);
+    }
+    let output = command.output().unwrap();
+    let told = [output.stdout, output.stderr].map(|text| String::from_utf8_lossy(&text).into_owned());
+    assert!(output.status.success(), "{}", told.concat());
+}

@@ -1,0 +1,415 @@
+//! The viewfinder on simulated rigs: what it shows, what clients change, and how it ends.
+#![expect(clippy::unwrap_used, reason = "a helper of a test fails the test")]
+
+mod process;
+
+use std::process::{Command, Output, Stdio};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use raysweep::Probes;
+use raysweep::Runner;
+use raysweep::control::Control;
+use raysweep::live::{LiveFile, LiveReader, VIEWFINDER};
+use raysweep::rig::{AnyRig, Devices, Rig};
+use raysweep_core::{DeviceError, FinderPicture, Pattern, Projector, Shown};
+use raysweep_processing::process as process_session;
+use raysweep_proto::{ErrorCode, Event, RunParams, RunState, ViewfinderParams, ViewfinderValues};
+use raysweep_session::Session;
+use raysweep_sim::{LensControl, LensOf, PlaneTruth};
+use tempfile::TempDir;
+use tokio::sync::broadcast;
+use tokio::sync::broadcast::error::TryRecvError;
+
+const PLANE: &str = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver = \"sim\"\n[projector]\ndriver = \"sim\"\n\
+                     [sim]\nscene = \"v-groove\"\nscene_rows = 96\nscene_columns = 96\nseed = 5\n\
+                     [sim.board]\nprojector_columns = [0.40, 0.475]\n";
+
+/// How long a test waits for what must come.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// A daemon's core with a viewfinder, and its events.
+struct View {
+    runner: Runner,
+    events: broadcast::Receiver<Event>,
+    folder: TempDir,
+    /// What the projector was told, `None`: dark.
+    told: Arc<Mutex<Vec<Option<Pattern>>>>,
+    lenses: Option<LensControl>,
+    truth: Option<PlaneTruth>,
+}
+
+impl View {
+    fn new(rig: &str, plan: &str) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("rig.toml");
+        std::fs::write(&path, rig).unwrap();
+        let told = Arc::new(Mutex::new(Vec::new()));
+        let rig = AnyRig::load(&path).unwrap();
+        let simulated = match &rig {
+            AnyRig::Plane(rig) => rig.simulated(),
+            AnyRig::Dots(_) => None,
+        };
+        let (lenses, truth) = (simulated.map(|sim| sim.lenses()), simulated.map(|sim| sim.truth().clone()));
+        let spy = told.clone();
+        let devices = move |devices: Devices| {
+            let projector = Box::new(Spied { inner: devices.projector, told: spy.clone() });
+            Devices { projector, ..devices }
+        };
+        let live = LiveFile::create(&folder.path().join("live")).unwrap();
+        let runner = Runner::new(rig, folder.path().join("sessions"))
+            .unwrap()
+            .with_live(live)
+            .with_probes(Probes { devices: Some(Arc::new(devices)), ..Probes::default() });
+        let events = runner.events();
+        let plan = format!("kind = \"viewfinder\"\n[viewfinder]\npictures_per_s = 30\n{plan}");
+        runner.run(RunParams { plan, ..RunParams::default() }).unwrap();
+        Self { runner, events, folder, told, lenses, truth }
+    }
+
+    fn event(&mut self) -> Event {
+        let began = Instant::now();
+        loop {
+            match self.events.try_recv() {
+                Ok(event) => return event,
+                Err(TryRecvError::Lagged(_)) => {}
+                Err(TryRecvError::Empty) => {
+                    assert!(began.elapsed() < PATIENCE, "no event");
+                    std::thread::sleep(Duration::from_millis(1));
+                }
+                Err(TryRecvError::Closed) => panic!("the daemon's core has ended"),
+            }
+        }
+    }
+
+    /// The next picture for which this holds.
+    fn picture(&mut self, holds: impl Fn(&ViewfinderValues) -> bool) -> ViewfinderValues {
+        let began = Instant::now();
+        loop {
+            match self.event() {
+                Event::Viewfinder(values) if holds(&values) => return *values,
+                Event::Finished { error, .. } => panic!("the viewfinder has ended: {error:?}"),
+                event => assert!(began.elapsed() < PATIENCE, "no such picture; {event:?}"),
+            }
+        }
+    }
+
+    /// The state in which the run ends, and its error.
+    fn end(&mut self) -> (String, Option<String>) {
+        loop {
+            if let Event::Finished { state, error, .. } = self.event() {
+                return (state, error);
+            }
+        }
+    }
+
+    fn change(&self, wanted: ViewfinderParams) {
+        self.runner.viewfinder(&wanted).unwrap();
+    }
+
+    fn show(&self, picture: FinderPicture) {
+        self.change(ViewfinderParams { picture: Some(picture), ..ViewfinderParams::default() });
+    }
+}
+
+/// A projector that notes what it is told.
+struct Spied {
+    inner: Box<dyn Projector>,
+    told: Arc<Mutex<Vec<Option<Pattern>>>>,
+}
+
+impl Projector for Spied {
+    fn show(&mut self, pattern: &Pattern) -> Result<Shown, DeviceError> {
+        self.told.lock().unwrap().push(Some(pattern.clone()));
+        self.inner.show(pattern)
+    }
+
+    fn blank(&mut self) -> Result<Shown, DeviceError> {
+        self.told.lock().unwrap().push(None);
+        self.inner.blank()
+    }
+}
+
+#[test]
+fn pictures_and_their_figures_are_published_until_it_is_cancelled() {
+    let mut view = View::new(PLANE, "subject = \"board\"\nregion = [10, 80, 20, 90]\n");
+    let values = view.picture(|values| values.pictures == 3);
+    assert_eq!((values.picture, values.region), (FinderPicture::White, [10, 80, 20, 90]));
+    assert_eq!(values.histogram.iter().sum::<u64>(), 70 * 70);
+    assert_eq!((values.row_cut.len(), values.column_cut.len()), (70, 70));
+    // The white board gives the white level above black.
+    assert!((values.mean_dn / 2564.0 - 1.0).abs() < 0.02, "{}", values.mean_dn);
+    assert_eq!((values.saturated, values.underexposed), (0.0, 0.0));
+    let status = view.runner.status();
+    assert!(status.state == RunState::Running && status.viewfinder.is_some(), "{status:?}");
+
+    let image =
+        LiveReader::open(&view.folder.path().join("live")).unwrap().newest(VIEWFINDER).unwrap().unwrap();
+    assert_eq!(image.image.shape(), [96, 96]);
+    let is_close = |dn: &&f32| (**dn / 2564.0 - 1.0).abs() < 0.15;
+    assert!(image.image.iter().filter(is_close).count() > 9000);
+    assert_eq!(image.metadata["saturation_dn"], 0.97 * 4095.0);
+
+    view.show(FinderPicture::Black);
+    let dark = view.picture(|values| values.picture == FinderPicture::Black);
+    assert!(dark.underexposed > 0.99 && dark.mean_dn < 70.0, "{dark:?}");
+    view.change(ViewfinderParams { region: Some([0, 8, 0, 96]), ..ViewfinderParams::default() });
+    assert_eq!(view.picture(|values| values.region == [0, 8, 0, 96]).column_cut.len(), 8);
+    for (params, field) in [
+        (ViewfinderParams { region: Some([0, 97, 0, 96]), ..ViewfinderParams::default() }, "region"),
+        (ViewfinderParams { region: Some([5, 5, 0, 96]), ..ViewfinderParams::default() }, "region"),
+        (ViewfinderParams { exposure_us: Some(f64::NAN), ..ViewfinderParams::default() }, "exposure_us"),
+    ] {
+        let error = view.runner.viewfinder(&params).unwrap_err();
+        assert_eq!(
+            (error.name(), error.data.unwrap().field.unwrap().as_str()),
+            (Some(ErrorCode::InvalidParams), field)
+        );
+    }
+
+    view.runner.cancel().unwrap();
+    assert_eq!(view.end(), ("complete".into(), None));
+    assert_eq!(view.told.lock().unwrap().last(), Some(&None), "the light is off");
+    assert_eq!(view.runner.status().viewfinder, None);
+    assert_eq!(
+        view.runner.viewfinder(&ViewfinderParams::default()).unwrap_err().name(),
+        Some(ErrorCode::NotRunning)
+    );
+    // It has stored when there was light, and nothing to process.
+    let dir = view.runner.status().session.unwrap();
+    let state = Session::open(&dir).unwrap().state().unwrap();
+    assert_eq!(
+        (state.session.kind.as_str(), state.stored_points(), state.missing_points()),
+        ("viewfinder", 0, 0)
+    );
+    assert!(process_session(&dir).unwrap_err().to_string().contains("stores no images"));
+    assert!(!dir.join("stack.zarr").exists());
+}
+
+#[test]
+fn it_ends_with_the_daemon_and_after_its_time_with_the_light_off() {
+    let mut view = View::new(PLANE, "");
+    view.picture(|_| true);
+    view.runner.shut_down();
+    assert_eq!(view.end().0, "complete");
+    assert_eq!(view.told.lock().unwrap().last(), Some(&None));
+    let mut view = View::new(PLANE, "seconds = 0.2\n");
+    assert_eq!(view.end(), ("complete".into(), None));
+    assert_eq!(view.told.lock().unwrap().last(), Some(&None));
+}
+
+#[test]
+fn what_keeps_it_from_showing_more_is_said() {
+    // A scene from a file is known by its rows.
+    let scene = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/data/p2r_corner.npz");
+    let corner = PLANE.replace("\"v-groove\"", &format!("{scene:?}"));
+    let mut view = View::new(&corner, "picture = \"grid\"\n");
+    let problem = view.picture(|values| values.problem.is_some()).problem.unwrap();
+    assert!(problem.contains("a checkerboard") && problem.contains("known by its rows"), "{problem}");
+    assert_eq!(view.picture(|values| values.pictures > 0).picture, FinderPicture::Black);
+    view.show(FinderPicture::Rows);
+    assert_eq!(view.picture(|values| values.picture == FinderPicture::Rows).problem, None);
+    view.show(FinderPicture::Align);
+    // A groove is no board, yet its rows can be seen or not: either is said.
+    view.picture(|values| values.alignment.is_some() || values.problem.is_some());
+    drop(view);
+
+    let mut view = View::new(&PLANE.replace("[sim.board]", "[sim.vsync]\nmissing = 1.0\n[sim.board]"), "");
+    let waits = view.picture(|values| values.problem.is_some());
+    assert!(waits.problem.unwrap().contains("the camera gets no trigger"));
+    view.runner.cancel().unwrap();
+    assert_eq!(view.end().0, "complete");
+}
+
+/// Where the mean focus score of pictures at these positions is largest, by a parabola through the best and its
+/// neighbours at some distance.
+fn sharpest(view: &mut View, lens: LensOf, positions_mm: &[f64]) -> f64 {
+    let lenses = view.lenses.clone().unwrap();
+    let scores: Vec<f64> = positions_mm
+        .iter()
+        .map(|&position_mm| {
+            lenses.turn(lens, position_mm);
+            // Frames before may be under way, and a score is of two pictures.
+            let skipped = 3;
+            let scores =
+                (0..skipped + 3).map(|_| view.picture(|values| values.focus.is_some()).focus.unwrap().score);
+            scores.skip(skipped).sum()
+        })
+        .collect();
+    let best = (0..scores.len()).max_by(|&a, &b| scores[a].total_cmp(&scores[b])).unwrap();
+    positions_mm[best]
+}
+
+#[test]
+fn the_focus_score_is_largest_where_the_lens_is_in_focus() {
+    let lenses = "[sim.camera.lens]\nposition_mm = 9.0\nfocus_mm = 8.37\ndepth_of_field_mm = 0.6\n\
+                  [sim.projector.lens]\nposition_mm = -2.0\nfocus_mm = -2.13\ndepth_of_field_mm = 0.4\n";
+    let mut view = View::new(&format!("{PLANE}{lenses}"), "subject = \"board\"\npicture = \"grid\"\n");
+    let positions =
+        |middle: f64, step: f64| (-12..=12).map(|i| middle + step * f64::from(i)).collect::<Vec<_>>();
+    // Steps that meet the focus of neither.
+    let found = sharpest(&mut view, LensOf::Camera, &positions(8.30, 0.055));
+    assert!((found - 8.37).abs() < 0.06, "{found}");
+    view.lenses.as_ref().unwrap().turn(LensOf::Camera, 8.37);
+    let found = sharpest(&mut view, LensOf::Projector, &positions(-2.05, 0.035));
+    assert!((found + 2.13).abs() < 0.04, "{found}");
+}
+
+#[test]
+fn the_align_aid_measures_a_misalignment_to_a_tenth_of_a_row() {
+    let truth = "[sim.truth]\nrow_offset_rows = 0.4\nrotation_deg = 0.2\nmagnification = 1.01\n";
+    let rig = format!("{PLANE}{truth}");
+    let mut view = View::new(&rig, "subject = \"board\"\npicture = \"align\"\n");
+    let found = view.picture(|values| values.alignment.is_some()).alignment.unwrap();
+    let truth = view.truth.clone().unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("rig.toml");
+    std::fs::write(&path, &rig).unwrap();
+    let first_row = Rig::load(&path).unwrap().simulated().unwrap().first_row() as f64;
+    // Everywhere in the picture, what was found leads to the row that the pixel truly sees.
+    let worst = (0..96 * 96)
+        .map(|pixel| {
+            let (t, s) = (pixel / 96, pixel % 96);
+            let (down, right) = (t as f64 - 47.5, s as f64 - 47.5);
+            let off = found.shift_rows
+                + found.rotation_deg.to_radians().tan() * right
+                + (found.magnification - 1.0) * down;
+            (first_row + t as f64 + off - truth.place(t, s)).abs()
+        })
+        .fold(0.0, f64::max);
+    println!("{found:?}, at most {worst:.3} rows off");
+    assert!(worst < 0.1, "{found:?}: {worst} rows off");
+    assert!((found.shift_rows - 0.4).abs() < 0.05 && (found.rotation_deg - 0.2).abs() < 0.05, "{found:?}");
+    assert!((found.magnification - 1.01).abs() < 0.001 && found.residual_rows < 0.1, "{found:?}");
+    assert_eq!(found.advice.len(), 3, "{found:?}");
+    // It is measured again and again.
+    assert_eq!(
+        view.picture(|values| values.alignment.as_ref().is_some_and(|found| found.measured == 2)).picture,
+        FinderPicture::Align
+    );
+}
+
+#[test]
+fn the_dot_of_a_dot_rig_has_its_place_size_and_peak() {
+    let rig = "kind = \"dots\"\n[camera]\ndriver = \"sim\"\n[mirror]\ndriver = \"sim\"\n[sim.dots]\nrows = 36\ncolumns = 64\n";
+    let mut view = View::new(rig, "");
+    let dot = view.picture(|values| values.dot.is_some()).dot.unwrap();
+    println!("{dot:?}");
+    // The rig's dot is 0.42 degrees wide, and its 9.27 degrees fill 64 columns. The mirror at rest points at the middle,
+    // where the groove's sides do not send back the same light.
+    assert!((dot.fwhm_px / (0.42 / 9.27 * 64.0) - 1.0).abs() < 0.15, "{dot:?}");
+    assert!(
+        (dot.row - 17.5).abs() < 3.0 && (dot.column - 31.5).abs() < 3.0 && dot.peak_dn > 100.0,
+        "{dot:?}"
+    );
+    view.show(FinderPicture::Black);
+    let dark = view.picture(|values| values.picture == FinderPicture::Black);
+    assert_eq!(dark.dot, None);
+    view.runner.cancel().unwrap();
+    assert_eq!(view.end(), ("complete".into(), None));
+    let mut tilted = View::new(rig, "tilt_deg = [1.0, 0.0]\n");
+    let moved = tilted.picture(|values| values.dot.is_some()).dot.unwrap();
+    assert!((moved.column - dot.column).abs() > 3.0, "{dot:?} and {moved:?}");
+}
+
+/// The command line and a daemon of its own.
+struct Program {
+    folder: TempDir,
+    _daemon: process::Process,
+}
+
+impl Program {
+    fn start(rig: &str) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("rig.toml"), rig).unwrap();
+        let mut command = Command::new(env!("CARGO_BIN_EXE_raysweepd"));
+        command.current_dir(&folder).args(["--rig", "rig.toml", "--socket", "socket", "--data", "sessions"]);
+        let daemon = process::Process::start(command.stderr(Stdio::null()));
+        let program = Self { folder, _daemon: daemon };
+        let began = Instant::now();
+        while !program.raysweep(&["status"]).status.success() {
+            assert!(began.elapsed() < PATIENCE, "the daemon does not answer");
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        program
+    }
+
+    fn raysweep(&self, arguments: &[&str]) -> Output {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_raysweep"));
+        command.current_dir(&self.folder).args(["--socket", "socket"]).args(arguments).output().unwrap()
+    }
+
+    fn plan(&self, text: &str) {
+        std::fs::write(self.folder.path().join("plan.toml"), text).unwrap();
+    }
+}
+
+/// A scene whose white is brighter than the rig file says.
+const BRIGHT: &str = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver = \"sim\"\n[projector]\ndriver = \"sim\"\n\
+                      [sim]\nscene = \"mix\"\nscene_rows = 96\nscene_columns = 96\nseed = 9\n[sim.truth]\nwhite_dn = 2800\n";
+
+/// What the sensor makes of the scene in an exposure, from the light alone and the sensor's data: the share of samples
+/// above the limit, and the median signal over noise.
+fn brute_force(rig: &Rig, exposure_us: f64) -> (f64, f64) {
+    let light = rig.simulated().unwrap().noise_free(0.0, exposure_us).unwrap();
+    let signals_e: Vec<f64> = light.iter().map(|&light| f64::from(light) * 2800.0 * 1.66).collect();
+    let noise_e = |e: f64| (81.0 + e).sqrt();
+    let limit_e = (0.97 * 4095.0 - 64.0) * 1.66;
+    // Logistic approximation of the normal distribution's tail.
+    let above = |e: f64| 1.0 / (1.0 + (1.702 * (limit_e - e) / noise_e(e)).exp());
+    let share = signals_e.iter().map(|&e| above(e)).sum::<f64>() / signals_e.len() as f64;
+    let mut ratios: Vec<f64> = signals_e.iter().map(|&e| e / noise_e(e)).collect();
+    ratios.sort_by(f64::total_cmp);
+    (share, ratios[ratios.len() / 2])
+}
+
+#[test]
+fn the_proposed_exposure_saturates_nothing_and_is_as_good_as_the_best_of_all() {
+    let program = Program::start(BRIGHT);
+    program.plan("kind = \"sweep\"\nname = \"mine\"\n[sweep]\ndelay_us = [-300, 0, 300]\nexposure_us = [100, 1000, 15000]\n");
+    let output = program.raysweep(&["--json", "expose", "plan.toml"]);
+    let said = String::from_utf8(output.stdout).unwrap();
+    assert!(output.status.success(), "{said} {}", String::from_utf8_lossy(&output.stderr));
+    let proposed: serde_json::Value = serde_json::from_str(&said).unwrap();
+    let exposure_us = proposed["exposure_us"].as_f64().unwrap();
+    let rig = Rig::load(&program.folder.path().join("rig.toml")).unwrap();
+    let (_, ratio) = brute_force(&rig, exposure_us);
+    let best = (0..=100)
+        .map(|step| 100.0 * 150_f64.powf(f64::from(step) / 100.0))
+        .map(|us| (us, brute_force(&rig, us)))
+        .filter(|(_, (share, _))| *share <= 1e-4)
+        .max_by(|(_, (_, a)), (_, (_, b))| a.total_cmp(b))
+        .unwrap();
+    let mut view = View::new(BRIGHT, &format!("exposure_us = {exposure_us:?}\n"));
+    let saturated = (0..30).map(|_| view.picture(|_| true).saturated).sum::<f64>() / 30.0;
+    println!("{exposure_us} us: {saturated:.1e} saturated, SNR {ratio:.2}; best {best:?}; {proposed}");
+    assert!(saturated <= 1e-4, "{saturated} in {exposure_us} us");
+    assert!(ratio >= 0.95 * best.1.1, "{ratio} in {exposure_us} us; best {best:?}");
+    assert!(best.0 < 14_000.0, "the longest exposure saturates, or nothing was to be found");
+    // The plan is whole, and has no longer exposure.
+    let plan = proposed["plan"].as_str().unwrap();
+    let plan = raysweep_config::Plan::parse(plan).unwrap();
+    let raysweep_config::Procedure::Sweep(sweep) = &plan.procedure else { panic!("{plan:?}") };
+    let kept = [100.0, 1000.0, 15_000.0].into_iter().filter(|us| *us < exposure_us).chain([exposure_us]);
+    assert_eq!((plan.name.as_str(), sweep.exposure_us.values()), ("mine", kept.collect()));
+    assert_eq!(proposed["average"], sweep.average);
+    assert!(proposed["expected"]["noise"]["median"].as_f64().unwrap() > 0.0);
+    // It has left the daemon idle, and says so to people too.
+    assert!(String::from_utf8(program.raysweep(&["status"]).stdout).unwrap().contains("idle"));
+    program.plan("kind = \"darks\"\n");
+    let refused = program.raysweep(&["expose", "plan.toml"]);
+    assert!(String::from_utf8(refused.stderr).unwrap().contains("no exposures to choose"));
+}
+
+#[test]
+fn a_scene_that_saturates_in_every_exposure_needs_less_light() {
+    let program = Program::start(&BRIGHT.replace("white_dn = 2800", "white_dn = 9000"));
+    program.plan("kind = \"sweep\"\n[sweep]\ndelay_us = [-300, 0, 300]\nexposure_us = [600]\n");
+    let refused = program.raysweep(&["expose", "plan.toml"]);
+    let said = String::from_utf8(refused.stderr).unwrap();
+    assert_eq!(refused.status.code(), Some(1), "{said}");
+    assert!(
+        said.contains("even in the plan's shortest exposure, 600 us") && said.contains("close the aperture"),
+        "{said}"
+    );
+}
