@@ -5,6 +5,7 @@
 mod support;
 
 use std::collections::BTreeMap;
+use std::thread;
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::Signal;
@@ -299,6 +300,22 @@ fn a_camera_that_opens_again_and_then_stays_silent_is_given_up() {
     };
     assert_eq!(error.kind, DeviceErrorKind::Disconnected);
     assert!(error.to_string().contains("delivered nothing within camera.reopen_s = 10 s"), "{error}");
+}
+
+#[test]
+fn cameras_that_open_at_once_do_not_disturb_each_other() {
+    thread::scope(|scope| {
+        for size in [128, 192, 256, 320] {
+            scope.spawn(move || {
+                own_network();
+                let _device = FakeCamera::start(&[]);
+                for _ in 0..20 {
+                    let camera = AravisCamera::open(&config(16_667, size), FACTS).unwrap();
+                    assert_eq!(camera.capabilities().width, size as usize);
+                }
+            });
+        }
+    });
 }
 
 #[test]

@@ -4,14 +4,14 @@ use std::ffi::CStr;
 use std::net::IpAddr;
 use std::ops::RangeInclusive;
 use std::sync::atomic::{AtomicI64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::Duration;
 
 use aravis::glib;
 use aravis::glib::object::Cast;
 use aravis::prelude::*;
-use aravis::{Aravis, Camera, GcFeatureNode, GvDevice};
+use aravis::{Aravis, Camera, ChunkParser, GcFeatureNode, GvDevice};
 use raysweep_core::{Clock, DeviceError, DeviceErrorKind, RoundTrip};
 
 use super::features::{FeatureError, Features, Result, first_present};
@@ -31,12 +31,17 @@ pub struct FoundCamera {
     pub protocol: String,
 }
 
-/// The library has one list of devices per process.
+/// The library has one list of devices and one parser of camera descriptions per process. Two cameras that open at
+/// once would share the parser's state (libaravis issue 159), so whatever lists, opens or parses holds this lock.
 static LIBRARY: Mutex<Option<Aravis>> = Mutex::new(None);
+
+fn library() -> MutexGuard<'static, Option<Aravis>> {
+    LIBRARY.lock().unwrap_or_else(PoisonError::into_inner)
+}
 
 /// Searches all networks and the USB for cameras; takes about a second.
 pub fn discover() -> Vec<FoundCamera> {
-    let mut library = LIBRARY.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut library = library();
     if library.is_none() {
         *library = Aravis::initialize().ok();
     }
@@ -107,7 +112,10 @@ impl Device {
             discover();
         }
         let no_camera = |what: String| DeviceError::new("camera", DeviceErrorKind::Disconnected, what);
-        let camera = Camera::new(Some(named)).map_err(|error| {
+        let opening = library();
+        let camera = Camera::new(Some(named));
+        drop(opening);
+        let camera = camera.map_err(|error| {
             no_camera(format!(
                 "no camera answers at {named}: {error}; is it powered and on this network? `raysweep devices` lists those that answer"
             ))
@@ -131,6 +139,12 @@ impl Device {
     pub fn model(&self) -> String {
         let parts = [self.camera.vendor_name(), self.camera.model_name(), self.camera.device_serial_number()];
         parts.into_iter().filter_map(|part| part.ok().map(String::from)).collect::<Vec<_>>().join(" ")
+    }
+
+    /// What reads the chunk data of frames; parses the camera's description again.
+    pub fn chunk_parser(&self) -> Option<ChunkParser> {
+        let _parsing = library();
+        self.camera.create_chunk_parser()
     }
 
     pub fn genicam(&self) -> Option<aravis::Gc> {

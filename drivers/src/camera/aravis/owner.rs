@@ -206,8 +206,7 @@ impl Owner {
             exposure_us: device.float_range(set_up.names.exposure)?,
             trigger_delay_us: delay_us,
         };
-        let parser = device.camera.create_chunk_parser();
-        let chunks = parser.map(|parser| Chunks::new(parser, set_up.chunks));
+        let chunks = device.chunk_parser().map(|parser| Chunks::new(parser, set_up.chunks));
         let mut writer = FeatureWriter::new(set_up.names);
         if let Some(settings) = &self.settings {
             writer.write(&device, settings)?;
