@@ -2,6 +2,7 @@
 //! opens the resulting session.
 
 pub mod dots;
+pub mod monte_carlo;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

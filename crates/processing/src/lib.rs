@@ -8,6 +8,7 @@ pub mod calibration;
 pub mod darks;
 mod export;
 pub mod film;
+pub mod materials;
 pub mod memory;
 pub mod mirror_response;
 pub mod patterns;

@@ -6,6 +6,7 @@
 //! all of u for 64 x 64 pixels. The array `mask`, uint8 of the same shape, tells what is known of each value; its
 //! attribute `bits` names the bits.
 
+use std::ops::Range;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -180,6 +181,26 @@ pub fn read_profiles(dir: &Path, pixels: &[[usize; 2]]) -> Result<Vec<Array1<f32
         zarr::read_part(&array, [0..depth, t..t + 1, s..s + 1]).map(|part| part.into_flat())
     };
     pixels.iter().map(profile).collect()
+}
+
+/// Shape `[u, t, s]` and attributes of the transport, without its values.
+///
+/// # Errors
+/// [`Error::Zarr`] or [`Error::Shape`] if it is missing or damaged.
+pub fn describe(dir: &Path) -> Result<([usize; 3], Map<String, Value>)> {
+    let array = zarr::open_array(&DurableStore::new(dir)?, NAME, 3)?;
+    let length = |axis: usize| array.shape().get(axis).map_or(0, |length| *length as usize);
+    Ok(([0, 1, 2].map(length), array.attributes().clone()))
+}
+
+/// Reads some camera rows of the transport: `[u, t, s]`.
+///
+/// # Errors
+/// [`Error::Shape`] for rows outside the image; otherwise as [`read`].
+pub fn read_rows(dir: &Path, rows: Range<usize>) -> Result<Array3<f32>> {
+    let array = zarr::open_array(&DurableStore::new(dir)?, NAME, 3)?;
+    let length = |axis: usize| array.shape()[axis] as usize;
+    zarr::read_part(&array, [0..length(0), rows, 0..length(2)])
 }
 
 /// Reads `transport [u, t, s]` and its attributes.

@@ -253,6 +253,23 @@ pub enum Command {
         /// The session's folder, or its name within the daemon's data folder
         session: PathBuf,
     },
+    /// Tell materials in sweeps by how light spreads in them; needs no daemon, unless sessions are given by their names
+    #[command(subcommand)]
+    Materials(MaterialsCommand),
+    /// Compare how light spreads in marked regions of sweeps: area-normalised delay profiles, widths, decay lengths
+    Profiles {
+        #[command(flatten)]
+        labelled: LabelledArguments,
+        /// Refractive index of the media, below air, for decay lengths
+        #[arg(long, value_name = "N", default_value_t = 1.33)]
+        refractive_index: f64,
+        /// Also write maps of width, asymmetry and decay length, with their standard deviations
+        #[arg(long)]
+        maps: bool,
+        /// The folder to create
+        #[arg(long, value_name = "FOLDER")]
+        to: PathBuf,
+    },
     /// Write manual pages and shell completions of all programs, for packages
     #[command(hide = true)]
     Manuals {
@@ -276,6 +293,64 @@ pub enum Command {
         #[arg(long)]
         accept_damage: bool,
     },
+}
+
+#[derive(Debug, Subcommand)]
+pub enum MaterialsCommand {
+    /// Train a model on labelled sweeps
+    Train {
+        #[command(flatten)]
+        labelled: LabelledArguments,
+        /// The file to create
+        #[arg(long, value_name = "FILE")]
+        to: PathBuf,
+    },
+    /// Find a model's materials in a sweep: a map, and a page with it
+    Apply {
+        /// The session's folder, or its name within the daemon's data folder
+        session: PathBuf,
+        /// A file written by `materials train`
+        #[arg(long, value_name = "FILE")]
+        model: PathBuf,
+        /// Side of the square of pixels whose mean profile is judged, odd: larger ones see through noise, and blur
+        #[arg(long, value_name = "PX", default_value_t = 3)]
+        window: usize,
+        #[command(flatten)]
+        scene: SceneScale,
+        /// The folder to create
+        #[arg(long, value_name = "FOLDER")]
+        to: PathBuf,
+    },
+    /// Compare what a model finds in sweeps with their labels: confusion matrices
+    Evaluate {
+        #[command(flatten)]
+        labelled: LabelledArguments,
+        /// A file written by `materials train`
+        #[arg(long, value_name = "FILE")]
+        model: PathBuf,
+        /// The folder to create
+        #[arg(long, value_name = "FOLDER")]
+        to: PathBuf,
+    },
+}
+
+#[derive(Debug, clap::Args)]
+pub struct LabelledArguments {
+    /// Folders of sweeps, or their names within the daemon's data folder
+    #[arg(required = true, value_name = "SESSION")]
+    pub sessions: Vec<PathBuf>,
+    /// What the pixels of a session show, TOML: once for each session in their order, or once for all
+    #[arg(long, required = true, value_name = "FILE")]
+    pub labels: Vec<PathBuf>,
+    #[command(flatten)]
+    pub scene: SceneScale,
+}
+
+#[derive(Debug, Clone, Copy, clap::Args)]
+pub struct SceneScale {
+    /// Height of a projector row on the scene, instead of `sweep.mm_per_row` of the plans
+    #[arg(long, value_name = "MM")]
+    pub mm_per_row: Option<f64>,
 }
 
 #[derive(Debug, clap::Args)]

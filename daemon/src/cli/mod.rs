@@ -12,6 +12,7 @@ mod failure;
 mod finder_text;
 mod follow;
 mod manuals;
+mod materials;
 mod plan_file;
 mod preview;
 mod printer;
@@ -231,6 +232,11 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             printer.print(&value, |_| show::processed(&made))?;
         }
         Command::Verify { session } => return verify(&folder_of(session, &socket), printer),
+        Command::Materials(command) => materials::tell(command, |given| folder_of(given, &socket), printer)?,
+        Command::Profiles { labelled, refractive_index, maps, to } => {
+            let about = materials::ProfileLook { refractive_index, maps };
+            materials::profiles(labelled, about, &to, |given| folder_of(given, &socket), printer)?;
+        }
         Command::Manuals { folder } => {
             manuals::write(&folder).map_err(|source| CommandFailure::Write { path: folder, source })?;
         }

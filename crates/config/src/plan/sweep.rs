@@ -26,6 +26,8 @@ pub struct SweepPlan {
     pub extra: Vec<GridPlan>,
     /// One more image under less light, for pixels that saturate; `None`: not taken.
     pub bracket: Option<BracketPlan>,
+    /// Height of a projector row on the scene, for results in millimetres; `None`: not known.
+    pub mm_per_row: Option<f64>,
 }
 
 /// `[[sweep.extra]]`: a further grid of delays and exposures.
@@ -55,6 +57,7 @@ impl Default for SweepPlan {
             max_jitter_us: 50.0,
             extra: Vec::new(),
             bracket: None,
+            mm_per_row: None,
         }
     }
 }
@@ -187,11 +190,12 @@ impl SweepPlan {
 
     /// Its tables in a plan.
     pub fn to_toml(&self) -> String {
-        let Self { delay_us, exposure_us, average, max_jitter_us, extra, bracket } = self;
+        let Self { delay_us, exposure_us, average, max_jitter_us, extra, bracket, mm_per_row } = self;
         let bracket = bracket
             .map_or_else(String::new, |bracket| format!("bracket = {{ light = {} }}\n", bracket.light));
+        let mm_per_row = mm_per_row.map_or_else(String::new, |mm| format!("mm_per_row = {mm}\n"));
         let own = format!(
-            "[sweep]\ndelay_us = {delay_us}\nexposure_us = {exposure_us}\naverage = {average}\nmax_jitter_us = {max_jitter_us}\n{bracket}"
+            "[sweep]\ndelay_us = {delay_us}\nexposure_us = {exposure_us}\naverage = {average}\nmax_jitter_us = {max_jitter_us}\n{mm_per_row}{bracket}"
         );
         let extra = extra.iter().map(|GridPlan { delay_us, exposure_us }| {
             format!("\n[[sweep.extra]]\ndelay_us = {delay_us}\nexposure_us = {exposure_us}\n")
@@ -235,6 +239,14 @@ impl SweepPlan {
             document.refuse(&["sweep", "average"], message);
         }
         document.check_positive(&["sweep", "max_jitter_us"], self.max_jitter_us, "microseconds");
+        if let Some(mm) = self.mm_per_row
+            && !(1e-3..=1e3).contains(&mm)
+        {
+            let message = format!(
+                "sweep.mm_per_row = {mm}: must be from 0.001 to 1000 mm of the scene for one projector row"
+            );
+            document.refuse(&["sweep", "mm_per_row"], message);
+        }
         if let Some(BracketPlan { light }) = self.bracket
             && !(light > 0.0 && light < 1.0)
         {

@@ -47,6 +47,8 @@ pub enum SeriesStyle {
     Dots,
     /// Bars from 0, as wide as the smallest distance in x: a histogram.
     Bars,
+    /// The area within these points, in the colour of the series before it: its uncertainty.
+    Band,
 }
 
 /// A vertical line that marks a value of x.
@@ -74,9 +76,9 @@ impl Plot {
             figure.plot {
                 figcaption {
                     strong { (self.title) }
-                    @if series.len() > 1 {
+                    @if self.named().count() > 1 {
                         span.legend {
-                            @for (series, colour) in series.iter().zip(PALETTE.iter().cycle()) {
+                            @for (series, colour) in self.named().zip(PALETTE.iter().cycle()) {
                                 span { i style=(format!("background:{colour}")) {} (series.name) }
                             }
                         }
@@ -85,6 +87,34 @@ impl Plot {
                 (drawing)
             }
         })
+    }
+
+    /// The series that have a colour of their own.
+    fn named(&self) -> impl Iterator<Item = &Series> {
+        self.series.iter().filter(|series| series.style != SeriesStyle::Band)
+    }
+
+    /// The plot as an SVG file of its own, with a legend below its upper edge.
+    ///
+    /// # Errors
+    /// [`crate::Error::Codec`] if it cannot be drawn or has no points.
+    pub fn to_svg(&self) -> Result<String> {
+        let failed = |what: &str| Error::codec("draw", format!("plot `{}`", self.title))(what.to_owned());
+        let series: Vec<_> = self.series.iter().map(Series::finite).collect();
+        let bounds = Bounds::of(&series, &self.guides).ok_or_else(|| failed("it has no points"))?;
+        let svg =
+            self.draw(&series, &bounds).map_err(Error::codec("draw", format!("plot `{}`", self.title)))?;
+        let legend: String = self
+            .named()
+            .zip(PALETTE.iter().cycle())
+            .zip(0..)
+            .map(|((series, colour), at)| {
+                let name = html! { (series.name) }.into_string();
+                let y = 26 + 18 * at;
+                format!("<text x=\"{}\" y=\"{y}\" text-anchor=\"end\" font-family=\"sans-serif\" font-size=\"14\" fill=\"{colour}\">{name}</text>\n", SIZE_PX.0 - 24)
+            })
+            .collect();
+        Ok(svg.replacen("</svg>", &format!("{legend}</svg>"), 1).replace("\"currentColor\"", "\"#333333\""))
     }
 
     fn draw(
@@ -126,9 +156,13 @@ impl Plot {
                 let (x, y) = chart.plotting_area().map_coordinate(&(guide.x, bounds.y.1));
                 root.draw_text(&guide.label, &style, (x, y - 4))?;
             }
-            for (series, colour) in series.iter().zip(PALETTE.iter().cycle()) {
+            for (series, colour) in series.iter().zip(colours(series)) {
                 let colour = parse_hex(colour);
                 match series.style {
+                    SeriesStyle::Band => {
+                        chart
+                            .draw_series([Polygon::new(series.points.clone(), colour.mix(0.25).filled())])?;
+                    }
                     SeriesStyle::Line => {
                         chart.draw_series(LineSeries::new(series.points.clone(), colour.stroke_width(2)))?;
                         // If there are few samples, show which values were measured.
@@ -158,7 +192,23 @@ impl Plot {
     }
 }
 
+/// The colour of each series: that of the series before it for a band.
+fn colours(series: &[Series]) -> impl Iterator<Item = &'static str> {
+    let mut next = 0;
+    series.iter().map(move |series| {
+        next += usize::from(series.style != SeriesStyle::Band);
+        PALETTE[next.saturating_sub(1) % PALETTE.len()]
+    })
+}
+
 impl Series {
+    /// A series drawn as an area between low and high values: (x, low, high).
+    pub fn band(points: &[(f64, f64, f64)]) -> Series {
+        let low = points.iter().map(|&(x, low, _)| (x, low));
+        let high = points.iter().rev().map(|&(x, _, high)| (x, high));
+        Series { name: String::new(), style: SeriesStyle::Band, points: low.chain(high).collect() }
+    }
+
     /// A series drawn as a line.
     pub fn line(name: impl Into<String>, points: Vec<(f64, f64)>) -> Series {
         Series { name: name.into(), style: SeriesStyle::Line, points }

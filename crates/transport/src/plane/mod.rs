@@ -30,6 +30,7 @@ mod noise;
 mod products;
 pub mod separation;
 mod solve;
+pub mod spread;
 
 pub use error::PlaneError;
 pub use model::{

@@ -38,6 +38,7 @@ impl Searched for SweepTask {
             max_jitter_us,
             extra,
             bracket: self.sweep.bracket,
+            mm_per_row: self.sweep.mm_per_row,
         })
     }
 
