@@ -273,6 +273,9 @@ fn the_decay_length_of_a_known_slab_comes_out_within_a_tenth() {
     println!("decay length {} +- {} mm, known {known_mm}", found.value, found.sd);
     assert!((found.value / known_mm - 1.0).abs() < 0.1, "{} of {known_mm}", found.value);
     assert!(found.sd < 0.1 * known_mm, "{}", found.sd);
+    let width = regions[0].effective_width_rows.unwrap();
+    // Of the order of the mean free path, 0.45 mm or 1.8 rows.
+    assert!((1.0..6.0).contains(&width.value) && width.sd < 0.5, "{width:?}");
     let asymmetry = regions[0].asymmetry.unwrap();
     assert!(asymmetry.value.abs() < 0.05, "{}", asymmetry.value);
     let maps = raysweep_session::products::Products::new(to.join(ended.session.file_name().unwrap()));

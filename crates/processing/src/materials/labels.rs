@@ -5,9 +5,12 @@ use std::io::BufReader;
 use std::path::Path;
 
 use ndarray::Array2;
+use raysweep_session::input;
 use serde::Deserialize;
 
-use crate::stored::{ProcessError, read};
+use crate::stored::ProcessError;
+
+const LARGEST_FILE_BYTES: u64 = 1 << 20;
 
 /// A file of labels, TOML.
 #[derive(Debug, Deserialize)]
@@ -46,7 +49,8 @@ impl Labels {
     /// # Errors
     /// When a file cannot be read or is of another size, or a region is outside of the image or empty.
     pub fn read(path: &Path, size: (usize, usize)) -> Result<Self, ProcessError> {
-        let text = read(path)?;
+        let text = input::read_text(path, LARGEST_FILE_BYTES)
+            .map_err(|error| ProcessError::Config(format!("cannot read {}: {error}", path.display())))?;
         let wrong = |what: String| ProcessError::Config(format!("{}: {what}", path.display()));
         let file: LabelFile = toml::from_str(&text).map_err(|error| wrong(error.to_string()))?;
         let mut labels = Self { names: Vec::new(), of_pixel: Array2::from_elem(size, None) };

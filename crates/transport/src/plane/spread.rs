@@ -62,8 +62,8 @@ impl SpreadProfile<'_> {
             let (below, above) = (self.at(k)?, self.at(-k)?);
             Some(if k == 0 { below } else { below + above })
         };
-        let light: Option<Vec<f64>> = (0..=reach).map(both).collect();
-        let light = light?;
+        // As far as both sides are known.
+        let light: Vec<f64> = (0..=reach).map_while(both).collect();
         let half = 0.5 * light.iter().sum::<f64>();
         if half.is_nan() || half <= 0.0 {
             return None;
@@ -82,8 +82,8 @@ impl SpreadProfile<'_> {
 
     /// Light from lower rows minus light from upper rows, as a share of both; `None` if there is none.
     pub fn asymmetry(&self) -> Option<f64> {
-        let side = |sign: i64| (1..=self.reach()).filter_map(|k| self.at(sign * k)).sum::<f64>();
-        let (below, above) = (side(1), side(-1));
+        let sides = (1..=self.reach()).map_while(|k| Some((self.at(k)?, self.at(-k)?)));
+        let (below, above) = sides.fold((0.0, 0.0), |sums, sides| (sums.0 + sides.0, sums.1 + sides.1));
         (below + above > 0.0).then(|| (below - above) / (below + above))
     }
 
@@ -218,6 +218,9 @@ mod tests {
         assert_eq!(of(&[1.0; 5]), Some(2.5));
         assert_eq!(of(&[1.0, 0.0, 0.0, 0.0, 1.0]), Some(4.0));
         assert_eq!(of(&[0.0; 5]), None);
+        // What is not known on one side is left out on both.
+        assert_eq!(of(&[f32::NAN, 1.0, 1.0, 1.0, 9.0]), Some(1.5));
+        assert_eq!(of(&[]), None);
     }
 
     #[test]
