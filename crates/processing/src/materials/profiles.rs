@@ -287,3 +287,65 @@ impl Bins {
         Ok(Self { unit, edges })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use ndarray::Array1;
+
+    use super::*;
+
+    const ROWS: usize = 101;
+
+    fn session(mm_per_row: f64) -> Transported {
+        Transported {
+            dir: PathBuf::new(),
+            size: (ROWS, 1),
+            mm_per_row: Some(mm_per_row),
+            row_time_us: None,
+            path: PathBuf::new(),
+            u_min: -50,
+            depth: ROWS,
+        }
+    }
+
+    /// Light exp(-|x|) of one mm, summed over rows of this size.
+    fn exponential(mm_per_row: f64) -> Array1<f32> {
+        let below = |x: f64| if x < 0.0 { 0.5 * x.exp() } else { 1.0 - 0.5 * (-x).exp() };
+        (-50..=50)
+            .map(|u| {
+                (below((f64::from(u) + 0.5) * mm_per_row) - below((f64::from(u) - 0.5) * mm_per_row)) as f32
+            })
+            .collect()
+    }
+
+    fn binned(mm_per_row: f64, light: &Array1<f32>, t: usize, bins: &Bins) -> Option<Array1<f32>> {
+        session(mm_per_row).binned(light.view(), t, bins, mm_per_row)
+    }
+
+    #[test]
+    fn shares_add_up_and_depend_on_neither_brightness_nor_distance() {
+        let bins = Bins { unit: DistanceUnit::Mm, edges: vec![0.0, 0.15, 0.45, 1.05, 2.4, 4.5] };
+        let near = binned(0.1, &exponential(0.1), 50, &bins).unwrap();
+        assert!((near.sum() - 1.0).abs() < 1e-6, "{near}");
+        let bright = binned(0.1, &(7.0 * exponential(0.1)), 50, &bins).unwrap();
+        let far = binned(0.3, &exponential(0.3), 50, &bins).unwrap();
+        for ((near, bright), far) in near.iter().zip(&bright).zip(&far) {
+            assert!((near - bright).abs() < 1e-6, "{near} {bright}");
+            assert!((near / far - 1.0).abs() < 0.02, "{near} {far}");
+        }
+    }
+
+    #[test]
+    fn one_side_stands_for_both_where_the_projector_ends() {
+        let bins = Bins { unit: DistanceUnit::Rows, edges: vec![0.0, 0.5, 3.5, 20.5] };
+        let light = exponential(0.3);
+        let middle = binned(1.0, &light, 50, &bins).unwrap();
+        let mut cut = light.clone();
+        // The pixel of row 4 has no rows further up than 4.
+        cut.slice_mut(s![..46]).fill(0.0);
+        let edge = binned(1.0, &cut, 4, &bins).unwrap();
+        assert!(middle.iter().zip(&edge).all(|(a, b)| (a - b).abs() < 1e-6), "{middle} {edge}");
+        let wide = Bins { edges: vec![0.0, 0.5, 3.5, 60.5], ..bins };
+        assert!(binned(1.0, &light, 50, &wide).is_none(), "no row is known so far away");
+    }
+}
