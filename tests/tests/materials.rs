@@ -172,12 +172,17 @@ fn a_model_that_was_written_and_read_finds_the_same_and_a_damaged_one_is_refused
         ("cut", cut(text.len() / 2)),
         ("another format", text.replace("\"raysweep_materials\": 1", "\"raysweep_materials\": 2")),
         ("a material too many", text.replacen("\"materials\": [", "\"materials\": [\"brick\", ", 1)),
+        (
+            "bins that do not begin at 0",
+            text.replacen("\"edges\": [\n      0.0", "\"edges\": [\n      0.01", 1),
+        ),
         ("no machine", text.replacen("svm_type c_svc", "svm_type c_sv", 1)),
         ("a count that is too large", text.replacen("total_sv ", "total_sv 99999999", 1)),
     ];
-    for (what, text) in cases {
+    for (what, damaged) in cases {
+        assert_ne!(damaged, text, "{what}");
         let path = folder.path().join("model.json");
-        fs::write(&path, text).unwrap();
+        fs::write(&path, damaged).unwrap();
         let error = MaterialModel::read(&path).unwrap_err().to_string();
         assert!(error.contains("model.json"), "{what}: {error}");
     }

@@ -300,10 +300,10 @@ impl MaterialModel {
         let materials = file.materials.len();
         let features = file.bins.edges.len().saturating_sub(1);
         let lengths = [file.mean.len(), file.deviation.len()];
-        let ascends = file.bins.edges.windows(2).all(|edges| edges[0] < edges[1]);
         let is_square =
             file.confusion.len() == materials && file.confusion.iter().all(|row| row.len() == materials);
-        if materials < 2 || features == 0 || lengths != [features; 2] || !ascends || !is_square {
+        if materials < 2 || features == 0 || lengths != [features; 2] || !file.bins.are_sound() || !is_square
+        {
             return Err(wrong(
                 "its materials, bins, mean, deviation and confusion do not fit each other".into(),
             ));

@@ -262,6 +262,12 @@ impl DistanceUnit {
 }
 
 impl Bins {
+    /// Whether they ascend from 0 and are no more than a model ever has: a file may say anything.
+    pub(super) fn are_sound(&self) -> bool {
+        let ascend = self.edges.windows(2).all(|edges| edges[0] < edges[1]);
+        ascend && self.edges.first() == Some(&0.0) && self.edges.len() <= EDGES_ROWS.len()
+    }
+
     /// Bins that all of these sessions can fill: in mm if all of them know their rows' size.
     ///
     /// # Errors
