@@ -19,6 +19,8 @@ use std::time::{Duration, Instant};
 
 use nix::unistd::Uid;
 use raysweep_proto::Client;
+use raysweep_session::Session;
+use raysweep_session::stack::ArrayName;
 use serde_json::{Value, json};
 
 use self::process::Process;
@@ -264,6 +266,38 @@ fn ten_browsers_cost_a_sweep_and_a_film_no_frame_and_no_bit() {
         let (alone, watched) = (files(&alone.join(array)), files(&watched.join(array)));
         assert!(alone.len() > 2 && alone == watched, "{array} differs");
     }
+}
+
+#[test]
+fn the_light_of_a_pixel_over_the_delays_is_that_of_the_stack() {
+    let lab = Lab::start();
+    let session = lab.run(SWEEP);
+    let page = lab.view(None);
+    let name = session.file_name().unwrap().to_str().unwrap();
+    let (status, _, body) = page.get(&format!("session/{name}/delays/5/7"));
+    assert_eq!(status, 200, "{}", String::from_utf8_lossy(&body));
+    let told: Value = serde_json::from_slice(&body).unwrap();
+    let opened = Session::open(&session).unwrap();
+    let (state, stack) = (opened.state().unwrap(), opened.stack().unwrap());
+    let of = |array, index: usize, frames: u32| {
+        f64::from(stack.read(array).unwrap()[[index, 5, 7]]) / f64::from(frames)
+    };
+    let mut points = 0;
+    for point in state.stored(ArrayName::Sum) {
+        let dark = state.stored(ArrayName::Dark).find(|dark| dark.exposure_us == point.exposure_us).unwrap();
+        let light =
+            of(ArrayName::Sum, point.index, point.frames) - of(ArrayName::Dark, dark.index, dark.frames);
+        let delays = told["delay_us"].as_array().unwrap();
+        let delay = delays.iter().position(|delay| delay.as_f64() == Some(point.delay_us)).unwrap();
+        let exposures = told["exposures"].as_array().unwrap();
+        let of_exposure = exposures.iter().find(|it| it["exposure_us"].as_f64() == Some(point.exposure_us));
+        let shown = of_exposure.unwrap()["light_dn"][delay].as_f64().unwrap();
+        assert!((shown - light).abs() < 1e-9, "{shown} {light}");
+        points += 1;
+    }
+    assert!(points > 20, "{points}");
+    let (status, ..) = page.get(&format!("session/{name}/delays/5000/7"));
+    assert_eq!(status, 404);
 }
 
 /// A run is checked, started, watched, paused, finished; its report is opened; two sessions are compared.

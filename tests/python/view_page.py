@@ -77,7 +77,12 @@ def visit(page, name):
     page.goto(address)
     expect(page.locator("#state")).to_have_text("idle")
     last = run(page, plan)
-    expect(page.locator("#live-picture canvas.image")).to_be_visible()
+    expect(page.locator("#live-names button")).to_have_count(3)
+    live = page.locator("#live-picture canvas.image")
+    expect(live).to_be_visible()
+    live.focus()
+    page.keyboard.press("ArrowDown")
+    expect(page.locator("#delays .u-wrap")).to_be_visible()
     shot(page, f"run-{name}")
     # With the keyboard: the tabs, then the session, then the pixel.
     page.focus("#tab-run")

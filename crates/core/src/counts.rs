@@ -67,6 +67,22 @@ impl fmt::Display for LossCause {
     }
 }
 
+/// How far a point is that is being taken.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub struct PointUnderWay {
+    /// Frames averaged so far.
+    pub frames: u32,
+    /// Frames that it needs.
+    pub of: u32,
+}
+
+impl PointUnderWay {
+    /// The share of its frames that it has, 0 to 1.
+    pub fn share(self) -> f64 {
+        f64::from(self.frames.min(self.of)) / f64::from(self.of.max(1))
+    }
+}
+
 /// What became of the triggers of a point, an attempt or a run.
 ///
 /// Invariant ([`Counts::balanced`]): `expected = averaged + settling + cancelled + sum(lost)`. `expected` grows with

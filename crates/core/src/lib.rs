@@ -23,7 +23,7 @@ mod viewfinder;
 
 pub use clock::{Clock, ClockHandle};
 pub use clock_model::{ClockModel, ClockQuality, RoundTrip};
-pub use counts::{Counts, LossCause, VsyncStats};
+pub use counts::{Counts, LossCause, PointUnderWay, VsyncStats};
 pub use decoding::{decoding_message, decoding_message_beside};
 pub use device::{
     Applied, Camera, CameraCapabilities, CameraSettings, DeviceState, FirstFrame, Projector, Readout,

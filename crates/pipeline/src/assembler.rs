@@ -7,8 +7,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use ndarray::Array2;
 use raysweep_core::{
-    Applied, CameraCapabilities, Counts, Edge, Frame, FrameStamp, LossCause, Raster, SettingsId, VsyncStats,
-    ns_from_us, us_from_ns,
+    Applied, CameraCapabilities, Counts, Edge, Frame, FrameStamp, LossCause, PointUnderWay, Raster,
+    SettingsId, VsyncStats, ns_from_us, us_from_ns,
 };
 
 use crate::edges::{EdgeTracker, Found, Line};
@@ -79,6 +79,8 @@ pub enum Decision {
     Unit(Unit),
     /// An attempt that lacks frames.
     Failed(SettingsId, Failure, Counts),
+    /// A long attempt goes on.
+    UnderWay(PointUnderWay),
     /// The pass is over; counts of frames outside any attempt, and statistics of the line so far.
     Flushed(Counts, VsyncStats),
 }
@@ -120,6 +122,8 @@ impl AssemblerConfig {
 const TRIGGER_TOLERANCE_NS: i64 = 200_000;
 /// How long a frame waits, on the host's clock, for the edges around it.
 const EDGE_PATIENCE_NS: i64 = 100_000_000;
+/// How long an attempt goes on, on the host's clock, until it is told again how far it is.
+const TOLD_EVERY_NS: i64 = 500_000_000;
 /// The exposure that a camera reports may differ from its setting by rounding.
 pub const EXPOSURE_TOLERANCE_US: f64 = 0.5;
 
@@ -157,6 +161,8 @@ struct AttemptFrames {
     clipped: Array2<u32>,
     any_clipped: bool,
     averaged: u32,
+    /// When it was last told how many are averaged; at first, when the first of them was.
+    told_ns: Option<i64>,
     delays_us: Vec<f64>,
     counts: Counts,
     starts_ns: Vec<i64>,
@@ -254,7 +260,11 @@ impl Assembler {
             Waiting::Frame(frame, label @ (Label::Counted | Label::CountedUnless { .. })) => {
                 match self.judge(&frame.stamp, label, flushing) {
                     Judgement::Undecided => return Some(Waiting::Frame(frame, label)),
-                    verdict => self.count(&frame, verdict),
+                    verdict => {
+                        self.count(&frame, verdict);
+                        let under_way = self.attempt.as_mut().and_then(|it| it.told_at(frame.stamp.host_ns));
+                        under_way.into_iter().for_each(|frames| decide(Decision::UnderWay(frames)));
+                    }
                 }
             }
             Waiting::Frame(frame, Label::Settling) => {
@@ -291,6 +301,7 @@ impl Assembler {
             clipped: Array2::zeros((self.config.camera.height, self.config.camera.width)),
             any_clipped: false,
             averaged: 0,
+            told_ns: None,
             delays_us: Vec::with_capacity(job.frames as usize),
             counts: Counts::default(),
             starts_ns: Vec::with_capacity(job.frames as usize),
@@ -446,6 +457,16 @@ impl Chain {
 }
 
 impl AttemptFrames {
+    /// How far it is at a frame's time, if that was not told for a while and frames are still missing.
+    fn told_at(&mut self, now_ns: i64) -> Option<PointUnderWay> {
+        let since = *self.told_ns.get_or_insert(now_ns);
+        let is_due = now_ns.saturating_sub(since) >= TOLD_EVERY_NS && self.averaged < self.job.frames;
+        is_due.then(|| {
+            self.told_ns = Some(now_ns);
+            PointUnderWay { frames: self.averaged, of: self.job.frames }
+        })
+    }
+
     fn finish(mut self, failure: Failure) -> Decision {
         self.counts.averaged = u64::from(self.averaged);
         if self.averaged < self.job.frames {

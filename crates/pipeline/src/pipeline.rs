@@ -5,7 +5,7 @@ use std::thread::{self, JoinHandle};
 
 use crossbeam_channel::{Receiver, Sender, bounded};
 use ndarray::Array2;
-use raysweep_core::{Counts, SettingsId, VsyncStats};
+use raysweep_core::{Counts, PointUnderWay, SettingsId, VsyncStats};
 
 use crate::assembler::{Assembler, AssemblerConfig, Decision, DeviceEvent, Failure};
 use crate::queue::{Input, Policy};
@@ -47,6 +47,8 @@ pub enum Ordered {
     Unit(Unit, Result<Array2<f32>, StageError>),
     /// An attempt that lacks frames.
     Failed(SettingsId, Failure, Counts),
+    /// A long attempt goes on.
+    UnderWay(PointUnderWay),
     /// A pass is over; counts of frames outside any attempt, and statistics of the line so far.
     Flushed(Counts, VsyncStats),
 }
@@ -157,6 +159,7 @@ impl Dispatch {
             Decision::Failed(id, failure, counts) => {
                 let _ = done.send((seq, Ordered::Failed(id, failure, counts)));
             }
+            Decision::UnderWay(frames) => drop(done.send((seq, Ordered::UnderWay(frames)))),
             Decision::Flushed(outside, vsync) => drop(done.send((seq, Ordered::Flushed(outside, vsync)))),
         }
     }

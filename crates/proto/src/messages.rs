@@ -3,7 +3,7 @@
 
 use std::path::PathBuf;
 
-use raysweep_core::{ClockQuality, Counts, FilmSummary, SettingsLatency, VsyncStats};
+use raysweep_core::{ClockQuality, Counts, FilmSummary, PointUnderWay, SettingsLatency, VsyncStats};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -52,6 +52,9 @@ pub struct Progress {
     pub points_stored: usize,
     /// Points that the run needs: those of the sweep, its dark images and the regular image.
     pub points_planned: usize,
+    /// The point that is being taken, if that takes long.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub under_way: Option<PointUnderWay>,
     /// What became of this run's triggers so far.
     pub counts: Counts,
     /// Seconds since the run began.

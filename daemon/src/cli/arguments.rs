@@ -133,7 +133,7 @@ pub enum Command {
         #[arg(long)]
         detach: bool,
     },
-    /// Follow the run in progress to its end; Ctrl-C stops following
+    /// Follow the run in progress to its end, across restarts of the daemon; Ctrl-C stops following
     Watch,
     /// Write the live images as a picture: epipolar light on the left, indirect light on the right; on a dot rig the newest
     /// batch under all dots

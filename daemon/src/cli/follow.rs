@@ -70,8 +70,8 @@ fn enter_pressed() -> bool {
 pub(super) fn follow(
     mut events: Subscription,
     session: &Path,
-    mut interrupts: Interrupts,
-    mut view: EventView,
+    interrupts: &mut Interrupts,
+    view: &mut EventView,
     mut on_interrupt: OnInterrupt,
 ) -> Result<Exit, CommandFailure> {
     let (mut cancelled, mut is_asked) = (false, false);

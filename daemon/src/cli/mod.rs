@@ -22,6 +22,7 @@ mod setup;
 mod show;
 mod view;
 mod viewfinder;
+mod watch;
 
 use std::ffi::OsString;
 use std::fs;
@@ -31,9 +32,7 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use raysweep_drivers::mirror::{self, Parked};
-use raysweep_proto::{
-    Client, ClientError, DesignParams, Empty, ErrorCode, Event, RpcError, RunParams, RunState, Started,
-};
+use raysweep_proto::{Client, DesignParams, Empty, RunParams, Started};
 use serde_json::json;
 
 use self::arguments::{Arguments, Command, RunArguments, RunDescription};
@@ -128,7 +127,7 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             let session = fs::canonicalize(&session).unwrap_or(session);
             return begin_run(&socket, printer, detach, |client| Ok(client.resume(&session)?));
         }
-        Command::Watch => return watch(&socket, printer),
+        Command::Watch => return watch::watch(&socket, printer),
         Command::Preview { output, follow } => {
             return preview::preview(&socket, &output, follow, printer);
         }
@@ -316,33 +315,10 @@ fn begin_run(
     }
     // Before the run begins, so that none of its events is missed, and no Ctrl-C ends us with the run unattended.
     let events = Client::connect(socket)?.subscribe()?;
-    let interrupts = Interrupts::new().map_err(CommandFailure::Signals)?;
+    let mut interrupts = Interrupts::new().map_err(CommandFailure::Signals)?;
     let Started { session } = begin(&mut client)?;
-    follow(events, &session, interrupts, EventView::new(printer), OnInterrupt::Cancel(client))
-}
-
-fn watch(socket: &Path, printer: Printer) -> Result<Exit, CommandFailure> {
-    let events = Client::connect(socket)?.subscribe()?;
-    let interrupts = Interrupts::new().map_err(CommandFailure::Signals)?;
-    let status = Client::connect(socket)?.status()?;
-    let under_way = !matches!(status.state, RunState::Idle | RunState::Faulted);
-    let Some(session) = status.session.filter(|_| under_way) else {
-        let message = "no run in progress; `raysweep sessions` lists earlier runs";
-        return Err(ClientError::Rpc(RpcError::new(ErrorCode::NotRunning, message)).into());
-    };
     let mut view = EventView::new(printer);
-    // What was said before anybody watched.
-    let state = Event::State { state: status.state, session: Some(session.clone()) };
-    let said = [
-        Some(state),
-        status.progress.map(Event::Progress),
-        status.viewfinder.map(Event::Viewfinder),
-        status.question.map(|text| Event::Ask { text }),
-    ];
-    for event in said.into_iter().flatten() {
-        view.show(&event).map_err(CommandFailure::Output)?;
-    }
-    follow(events, &session, interrupts, view, OnInterrupt::Leave)
+    follow(events, &session, &mut interrupts, &mut view, OnInterrupt::Cancel(client))
 }
 
 fn socket_path(argument: Option<PathBuf>, variable: Option<OsString>) -> PathBuf {

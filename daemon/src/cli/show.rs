@@ -4,7 +4,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use indicatif::{BinaryBytes, FormattedDuration};
-use raysweep_core::{ClockQuality, FilmSummary, Percentiles, SettingsLatency};
+use raysweep_core::{ClockQuality, FilmSummary, Percentiles, PointUnderWay, SettingsLatency};
 use raysweep_drivers::mirror::Parked;
 use raysweep_proto::{
     BetterPlan, CheckReport, Description, DesignReport, ErrorRange, ExpectedError, MirrorStatus, NoiseSource,
@@ -29,10 +29,10 @@ pub(super) fn status(status: &Status) -> String {
     if let Some(progress) = &status.progress {
         let (stored, planned) = (progress.points_stored, progress.points_planned);
         rows.push(("stored", format!("{stored} of {planned}, with dark and regular images")));
-        match is_over {
-            true => rows.push(("lost", progress.counts.losses())),
-            false => rows.push(("pace", pace(progress))),
+        if !is_over {
+            rows.push(("pace", pace(progress)));
         }
+        rows.push(("frames", frames(progress)));
         rows.push(("elapsed", duration(progress.elapsed_s)));
     }
     if let Some(film) = &status.film {
@@ -405,11 +405,17 @@ pub(super) fn audit(audit: &Audit, stored: usize, points: usize) -> String {
     lines.join("\n")
 }
 
-/// Remaining time, rate and losses, what matters most first.
+/// Rate and losses.
+pub(super) fn frames(progress: &Progress) -> String {
+    format!("{:.0} frames/s  {}", progress.frames_per_s, progress.counts.losses())
+}
+
+/// Progress within a long point, and remaining time.
 pub(super) fn pace(progress: &Progress) -> String {
+    let point = progress.under_way.map(|PointUnderWay { frames, of }| format!("frame {frames} of {of}  "));
     let left =
         progress.left_s.map_or_else(|| "time left unknown".into(), |left| format!("{} left", duration(left)));
-    format!("{left}  {:.0} frames/s  {}", progress.frames_per_s, progress.counts.losses())
+    format!("{}{left}", point.unwrap_or_default())
 }
 
 /// Text for a state.

@@ -1,9 +1,10 @@
-//! Displays a run: a bar on a terminal, lines elsewhere, JSON for programs.
+//! Displays a run: a bar and a line of details on a terminal, lines elsewhere, JSON for programs.
 
 use std::io::{self, IsTerminal, Write};
 use std::time::{Duration, Instant};
 
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
+use raysweep_core::{PointUnderWay, VsyncStats};
 use raysweep_proto::{Event, FilmEstimate, Progress, RunState, ViewfinderValues};
 
 use super::finder_text;
@@ -14,16 +15,22 @@ use super::show::{self, Ending};
 const PACE: Duration = Duration::from_secs(5);
 
 /// Fits into 80 columns: the message is cut where the terminal ends, so the line never wraps.
-const BAR: &str = "{prefix:>9} [{bar:20}] {pos}/{len}  {wide_msg}";
+const BAR: &str = "{prefix:>9} [{bar:20}] {wide_msg}";
+/// The line below the bar; all that a viewfinder shows, which has no end to count to.
+const DETAILS: &str = "{wide_msg}";
+/// Parts of a point that the bar can show.
+const PARTS: f64 = 1000.0;
 
-/// A viewfinder has no end to count to.
-const FINDER: &str = "{wide_msg}";
 /// Interval between a viewfinder's lines where they cannot be overwritten.
 const FINDER_PACE: Duration = Duration::from_secs(1);
 
 /// Displays a run's events.
 pub(super) struct EventView {
     place: Place,
+    /// The newest of what the line of details shows.
+    film: Option<String>,
+    frames: Option<String>,
+    vsync: Option<VsyncStats>,
     /// Points in the newest live estimate.
     live: Option<usize>,
     /// What a viewfinder has said of the rows, how often, and of its problem.
@@ -32,8 +39,8 @@ pub(super) struct EventView {
 
 /// Where the events are displayed.
 enum Place {
-    /// A progress bar on standard error.
-    Bar(ProgressBar),
+    /// A progress bar on standard error, and a line of details below it.
+    Bars { both: MultiProgress, bar: ProgressBar, details: ProgressBar },
     /// Occasional lines on standard error.
     Lines {
         /// When progress was last printed.
@@ -48,7 +55,14 @@ enum Place {
 impl EventView {
     /// The view that suits our output.
     pub fn new(printer: Printer) -> Self {
-        Self { place: Place::new(printer), live: None, said: (0, None) }
+        Self {
+            place: Place::new(printer),
+            film: None,
+            frames: None,
+            vsync: None,
+            live: None,
+            said: (0, None),
+        }
     }
 
     /// Displays an event; the result of a run goes to standard output, everything else to standard error.
@@ -66,7 +80,8 @@ impl EventView {
                 self.remark(&format!("point {point}, attempt {attempt}: {lost}; the point is taken again"));
             }
             Event::Film(estimate) => self.film(estimate),
-            Event::Vsync(_) | Event::Batch(_) => {}
+            Event::Vsync(vsync) => self.vsync = Some(*vsync),
+            Event::Batch(_) => {}
             Event::Viewfinder(values) => self.viewfinder(values),
             Event::Ask { text } => self.note(text),
             Event::Live { points, .. } => self.live = Some(*points),
@@ -83,9 +98,7 @@ impl EventView {
                 final_s,
                 light_s,
             } => {
-                if let Place::Bar(bar) = &self.place {
-                    bar.finish_and_clear();
-                }
+                self.clear();
                 if let Some(error) = error {
                     self.note(error);
                 }
@@ -115,7 +128,7 @@ impl EventView {
     /// Displays a note besides the run's events.
     pub fn note(&mut self, text: &str) {
         match &self.place {
-            Place::Bar(bar) => bar.suspend(|| eprintln!("{text}")),
+            Place::Bars { both, .. } => both.suspend(|| eprintln!("{text}")),
             Place::Lines { .. } | Place::Quiet | Place::Json => eprintln!("{text}"),
         }
     }
@@ -129,7 +142,7 @@ impl EventView {
 
     fn state(&mut self, state: RunState) {
         match &self.place {
-            Place::Bar(bar) => bar.set_prefix(show::state(state)),
+            Place::Bars { bar, .. } => bar.set_prefix(show::state(state)),
             _ => self.remark(show::state(state)),
         }
     }
@@ -145,11 +158,9 @@ impl EventView {
         }
         let line = finder_text::line(values);
         match &mut self.place {
-            Place::Bar(bar) => {
-                if let Ok(style) = ProgressStyle::with_template(FINDER) {
-                    bar.set_style(style);
-                }
-                bar.set_message(line);
+            Place::Bars { bar, details, .. } => {
+                bar.finish_and_clear();
+                details.set_message(line);
             }
             Place::Lines { told } if told.is_none_or(|told| told.elapsed() >= FINDER_PACE) => {
                 *told = Some(Instant::now());
@@ -161,27 +172,49 @@ impl EventView {
 
     fn film(&mut self, estimate: &FilmEstimate) {
         // Too many for lines; the film's progress is shown in the bar and by `raysweep status`.
-        if let Place::Bar(bar) = &self.place {
-            bar.set_message(show::film(&estimate.film));
+        self.film = Some(show::film(&estimate.film));
+        if let Place::Bars { details, .. } = &self.place {
+            details.set_message(self.details());
         }
     }
 
     fn progress(&mut self, progress: &Progress) {
-        let mut details = show::pace(progress);
-        if let Some(points) = self.live {
-            details.push_str(&format!("  live estimate of {points}"));
-        }
+        let stored = format!("{}/{}", progress.points_stored, progress.points_planned);
+        let pace = show::pace(progress);
+        self.frames = Some(show::frames(progress));
+        let all = self.details();
         match &mut self.place {
-            Place::Bar(bar) => {
-                bar.set_length(progress.points_planned as u64);
-                bar.set_position(progress.points_stored as u64);
-                bar.set_message(details);
+            Place::Bars { bar, details, .. } => {
+                let parts = progress.under_way.map_or(0.0, PointUnderWay::share) * PARTS;
+                bar.set_length(progress.points_planned as u64 * PARTS as u64);
+                bar.set_position(progress.points_stored as u64 * PARTS as u64 + parts as u64);
+                bar.set_message(format!("{stored}  {pace}"));
+                details.set_message(all);
             }
             Place::Lines { told } if told.is_none_or(|told| told.elapsed() >= PACE) => {
                 *told = Some(Instant::now());
-                eprintln!("{}/{} stored  {details}", progress.points_stored, progress.points_planned);
+                eprintln!("{stored} stored  {pace}  {all}");
             }
             Place::Lines { .. } | Place::Quiet | Place::Json => {}
+        }
+    }
+
+    /// Rate, losses, the film so far, the line's jitter and the live estimate, as far as they are known.
+    fn details(&self) -> String {
+        let vsync = self.vsync.map(|vsync| format!("VSYNC jitter {:.2} us", vsync.jitter_us));
+        let live = self.live.map(|points| format!("live estimate of {points}"));
+        [self.frames.clone(), self.film.clone(), vsync, live]
+            .into_iter()
+            .flatten()
+            .collect::<Vec<_>>()
+            .join("  ")
+    }
+
+    /// Removes what can be overwritten.
+    pub fn clear(&self) {
+        if let Place::Bars { bar, details, .. } = &self.place {
+            bar.finish_and_clear();
+            details.finish_and_clear();
         }
     }
 }
@@ -197,10 +230,14 @@ impl Place {
         if !io::stderr().is_terminal() {
             return Self::Lines { told: None };
         }
-        let bar = ProgressBar::new(0);
-        if let Ok(style) = ProgressStyle::with_template(BAR) {
-            bar.set_style(style.progress_chars("=> "));
-        }
-        Self::Bar(bar)
+        let both = MultiProgress::new();
+        let [bar, details] = [BAR, DETAILS].map(|template| {
+            let bar = both.add(ProgressBar::new(1));
+            match ProgressStyle::with_template(template) {
+                Ok(style) => bar.with_style(style.progress_chars("=> ")),
+                Err(_) => bar,
+            }
+        });
+        Self::Bars { both, bar, details }
     }
 }

@@ -74,8 +74,7 @@ impl Sink for PointSink {
                     self.fail(unit.id, Failure::Interrupted, counts);
                     return;
                 }
-                self.progress.stored += 1;
-                self.progress.counts.add(&unit.counts);
+                self.progress.point_stored(&unit.counts);
                 match image {
                     Ok(image) => {
                         self.processing.push(&unit, &image);
@@ -90,6 +89,10 @@ impl Sink for PointSink {
                 self.run.board.publish(Event::Progress(self.progress.shown()));
             }
             Ordered::Failed(id, failure, counts) => self.fail(id, failure, counts),
+            Ordered::UnderWay(frames) => {
+                self.progress.under_way = Some(frames);
+                self.run.board.publish(Event::Progress(self.progress.shown()));
+            }
             Ordered::Flushed(outside, vsync) => {
                 if outside != Counts::default() {
                     self.outside(outside);
@@ -206,6 +209,7 @@ impl PointSink {
     fn fail(&mut self, id: SettingsId, failure: Failure, counts: Counts) {
         let (array, index) = place(self.role_of(id));
         self.progress.counts.add(&counts);
+        self.progress.under_way = None;
         if counts.lost_total() > 0 {
             self.run.board.publish(Event::Lost {
                 point: id.point,

@@ -347,10 +347,10 @@ fn watch_begins_with_what_an_operator_was_asked_before() {
     run(&daemon, &["run", &plan(&daemon, "hang"), "--detach"]);
     run(&daemon, &["pause"]);
     let mut child = command(&daemon, &["watch", "--json"]).stdout(Stdio::piped()).spawn().unwrap();
-    let lines = BufReader::new(child.stdout.take().unwrap()).lines().take(3);
+    let lines = BufReader::new(child.stdout.take().unwrap()).lines().take(4);
     let said: Vec<Value> = lines.flat_map(|line| json_lines(&line.unwrap())).collect();
     let kinds: Vec<_> = said.iter().map(|line| line["event"].as_str().unwrap()).collect();
-    assert_eq!(kinds, ["state", "progress", "ask"]);
+    assert_eq!(kinds, ["state", "progress", "ask", "vsync"]);
     assert_eq!((&said[0]["state"], &said[2]["text"]), (&"paused".into(), &"cover the lens".into()));
     kill(Pid::from_raw(child.id() as i32), Signal::SIGINT).unwrap();
     assert_eq!(child.wait().unwrap().code(), Some(0));

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use raysweep::control::Control;
 use raysweep::server::{Access, Limits, Listening, serve_within};
-use raysweep_core::{Counts, LossCause, VsyncStats};
+use raysweep_core::{Counts, LossCause, PointUnderWay, VsyncStats};
 use raysweep_proto::{
     BetterPlan, CalibrationInfo, CheckReport, Client, DesignParams, DesignReport, DoctorCheck, DoctorParams,
     DoctorReport, ErrorCode, ErrorRange, Event, ExpectedError, Grade, MirrorStatus, NoiseEstimate,
@@ -112,6 +112,7 @@ pub fn progress() -> Progress {
     Progress {
         points_stored: 37,
         points_planned: 75,
+        under_way: Some(PointUnderWay { frames: 3, of: 8 }),
         counts,
         elapsed_s: 1.5,
         left_s: Some(1.5),

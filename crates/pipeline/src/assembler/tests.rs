@@ -417,3 +417,24 @@ fn a_frame_that_found_no_room_is_lost_once() {
     let counts = &feed.unit().counts;
     assert_eq!((counts.expected, counts.lost_total()), (3, 1), "its trigger was answered");
 }
+
+#[test]
+fn a_long_attempt_tells_how_far_it_is_twice_a_second() {
+    let mut feed = Feed::new();
+    feed.edges(0, 2);
+    feed.begin(100, 700.0, 0);
+    for edge in 2..102 {
+        feed.edge(edge * PERIOD_NS);
+        feed.frame(edge, 1);
+    }
+    feed.push(DeviceEvent::End);
+    feed.edges(102, 104);
+    let told = feed.decisions.iter().map(|decision| match decision {
+        Decision::UnderWay(point) => (point.frames, point.of),
+        Decision::Unit(unit) => (unit.frames, 0),
+        _ => panic!("neither progress nor a unit"),
+    });
+    let told: Vec<_> = told.collect();
+    // 100 frames take 1.67 s; half a second is 30 periods.
+    assert_eq!(told, [(31, 100), (61, 100), (91, 100), (100, 0)]);
+}

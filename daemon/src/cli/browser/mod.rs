@@ -55,11 +55,13 @@ const CALLS: [Method; 9] = [
 ];
 
 /// The files of the page, with their types.
-const FILES: [(&str, &str, &[u8]); 9] = [
+const FILES: [(&str, &str, &[u8]); 11] = [
     ("", "text/html; charset=utf-8", include_bytes!("page/index.html")),
     ("style.css", "text/css; charset=utf-8", include_bytes!("page/style.css")),
     ("main.js", "text/javascript; charset=utf-8", include_bytes!("page/main.js")),
     ("picture.js", "text/javascript; charset=utf-8", include_bytes!("page/picture.js")),
+    ("plots.js", "text/javascript; charset=utf-8", include_bytes!("page/plots.js")),
+    ("delays.js", "text/javascript; charset=utf-8", include_bytes!("page/delays.js")),
     ("run.js", "text/javascript; charset=utf-8", include_bytes!("page/run.js")),
     ("finder.js", "text/javascript; charset=utf-8", include_bytes!("page/finder.js")),
     ("sessions.js", "text/javascript; charset=utf-8", include_bytes!("page/sessions.js")),
@@ -119,6 +121,7 @@ fn routes(view: Arc<View>, guard: Guard) -> Router {
         .route("/{token}/session/{session}/report", get(report))
         .route("/{token}/session/{session}/picture/{product}", get(product))
         .route("/{token}/session/{session}/pixel/{row}/{column}", get(pixel))
+        .route("/{token}/session/{session}/delays/{row}/{column}", get(delays))
         .layer(DefaultBodyLimit::max(MESSAGE_BYTES))
         .layer(middleware::from_fn_with_state(Arc::new(guard), guard::admit))
         .with_state(view)
@@ -237,6 +240,14 @@ async fn pixel(
     Segment((_, session, row, column)): Segment<(String, String, usize, usize)>,
 ) -> Response {
     read(move || Ok(Json(stored::pixel(&view.hub.session(&session)?, row, column)?).into_response())).await
+}
+
+/// Light of a pixel over the delays, from what a sweep has stored so far.
+async fn delays(
+    State(view): State<Arc<View>>,
+    Segment((_, session, row, column)): Segment<(String, String, usize, usize)>,
+) -> Response {
+    read(move || Ok(Json(stored::delays(&view.hub.session(&session)?, row, column)?).into_response())).await
 }
 
 /// Reads files without holding up other requests; an error becomes a text.

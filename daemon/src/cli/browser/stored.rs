@@ -4,6 +4,8 @@ use std::fs::{self, File};
 use std::io::Read;
 use std::path::Path;
 
+use raysweep_session::ledger::PointEntry;
+use raysweep_session::stack::{ArrayName, Contents};
 use raysweep_session::{Session, transport};
 use serde_json::{Value, json};
 
@@ -81,4 +83,49 @@ pub(super) fn pixel(folder: &Path, row: usize, column: usize) -> Result<Value, S
     let profiles = transport::read_profiles(&session.transport_path(), &[[row, column]]).map_err(told)?;
     let about = about(&session.products_path().join("transport.npy"));
     Ok(json!({ "u_min": about["u_min"], "light": profiles.first().map(|light| light.to_vec()) }))
+}
+
+/// Light of a pixel over the delays of a sweep, from what is stored so far: `{delay_us: [...], exposures: [{exposure_us,
+/// light_dn: [...]}]}`, in counts of one frame without its dark image; null where nothing is stored, empty for other runs.
+pub(super) fn delays(folder: &Path, row: usize, column: usize) -> Result<Value, String> {
+    let session = Session::open(folder).map_err(told)?;
+    let state = session.state().map_err(told)?;
+    if !matches!(state.session.shape.contents, Contents::Sweep { .. }) {
+        return Ok(json!({ "delay_us": [], "exposures": [] }));
+    }
+    let stack = session.stack().map_err(told)?;
+    let shape = stack.shape();
+    if row >= shape.rows || column >= shape.columns {
+        return Err(format!("the image has {} rows and {} columns", shape.rows, shape.columns));
+    }
+    let counts = |array, point: &PointEntry| {
+        let part = stack.read_rows(array, point.index, row..row + 1).map_err(told)?;
+        Ok::<_, String>(f64::from(part[[0, column]]) / f64::from(point.frames.max(1)))
+    };
+    let mut darks = Vec::new();
+    for dark in state.stored(ArrayName::Dark) {
+        darks.push((dark.exposure_us, counts(ArrayName::Dark, dark)?));
+    }
+    let points: Vec<&PointEntry> = state.stored(ArrayName::Sum).collect();
+    let ascending = |values: &mut Vec<f64>| {
+        values.sort_by(f64::total_cmp);
+        values.dedup();
+    };
+    let mut delay_us: Vec<f64> = points.iter().map(|point| point.delay_us).collect();
+    ascending(&mut delay_us);
+    let mut exposure_us: Vec<f64> = points.iter().map(|point| point.exposure_us).collect();
+    ascending(&mut exposure_us);
+    let mut light_dn = vec![vec![None; delay_us.len()]; exposure_us.len()];
+    for point in points {
+        let of = |values: &[f64], value| values.iter().position(|known| *known == value);
+        let places = of(&exposure_us, point.exposure_us).zip(of(&delay_us, point.delay_us));
+        let dark = darks.iter().find(|(exposure_us, _)| *exposure_us == point.exposure_us);
+        if let (Some((exposure, delay)), Some((_, dark))) = (places, dark) {
+            light_dn[exposure][delay] = Some(counts(ArrayName::Sum, point)? - dark);
+        }
+    }
+    let exposures = exposure_us.iter().zip(light_dn);
+    let exposures =
+        exposures.map(|(exposure_us, light)| json!({ "exposure_us": exposure_us, "light_dn": light }));
+    Ok(json!({ "delay_us": delay_us, "exposures": exposures.collect::<Vec<_>>() }))
 }

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use raysweep_core::{Counts, FramePool, SettingsId, Subject};
+use raysweep_core::{Counts, FramePool, PointUnderWay, SettingsId, Subject};
 use raysweep_pipeline::dots::{Arrival, DarkRun, Loss, Sensor};
 use raysweep_processing::batches::sampling;
 use raysweep_processing::response::{AXES, DotFinder, Record, ResponseTask};
@@ -24,6 +24,8 @@ use crate::run::progress::ProgressMeter;
 const HOT_SIGMAS: f64 = 8.0;
 /// Number of batches of dark frames that the background averages over.
 const BACKGROUND_BATCHES: u32 = 64;
+/// How often the progress within an axis is told.
+const TOLD_OF_AXIS: usize = 20;
 
 /// Result of acquisition.
 pub struct Recorded {
@@ -155,6 +157,11 @@ impl Recorder {
                         record.note(frame, place);
                         shown += 1;
                     }
+                    if came % (frames / TOLD_OF_AXIS).max(1) == 0 {
+                        let (frames, of) = (came as u32, frames as u32);
+                        progress.under_way = Some(PointUnderWay { frames, of });
+                        self.run.board.publish(Event::Progress(progress.shown()));
+                    }
                 }
                 Ok(())
             })
@@ -162,6 +169,7 @@ impl Recorder {
         let counts = arrivals.account(&after, shown)?;
         if !self.run.orders.go_on() {
             // A record that was cut short does not count.
+            progress.under_way = None;
             let counts = Counts { cancelled: counts.cancelled + counts.averaged, averaged: 0, ..counts };
             return self.append(&Entry::Outside { counts: counts.clone() }, counts, progress);
         }
@@ -169,6 +177,7 @@ impl Recorder {
         let of_axis = format!("products/chirp_{}.", AXES[axis]);
         self.run.ledger.append(&self.run.session.bind(|file| file.starts_with(&of_axis))?)?;
         progress.stored += 1;
+        progress.under_way = None;
         let empty = came - shown as usize;
         let entry = AxisEntry { axis, frames, lost: frames - came, empty, counts: counts.clone() };
         self.append(&Entry::Axis(entry), counts, progress)

@@ -2,6 +2,8 @@
 
 import { by, call, note } from "./main.js";
 import { hearFinder, showFinder, startFinder } from "./finder.js";
+import { startDelays } from "./delays.js";
+import { axisColour, gridColour } from "./plots.js";
 import { Picture, element, fetchPicture, number } from "./picture.js";
 
 const UNDER_WAY = ["preparing", "armed", "running", "paused", "draining"];
@@ -90,11 +92,13 @@ function draw() {
   by("cancel").disabled = !isUnderWay;
   by("start").disabled = by("check").disabled = isUnderWay || !state;
   by("progress").max = progress?.points_planned || 1;
-  by("progress").value = progress?.points_stored ?? 0;
+  const point = progress?.under_way;
+  by("progress").value = (progress?.points_stored ?? 0) + (point ? point.frames / point.of : 0);
   const rows = [];
   if (progress) {
     const lost = Object.entries(progress.counts.lost).map(([cause, frames]) => `${frames} ${words(cause)}`);
     rows.push(["stored", `${progress.points_stored} of ${progress.points_planned}`]);
+    if (isUnderWay && point) rows.push(["this point", `frame ${point.frames} of ${point.of}`]);
     if (isUnderWay) rows.push(["time left", clock(progress.left_s ?? NaN)]);
     rows.push(["elapsed", clock(progress.elapsed_s)], ["rate", `${number(progress.frames_per_s)} frames/s`],
       ["frames used", `${progress.counts.averaged} of ${progress.counts.expected}`], ["lost", lost.join(", ") || "none"]);
@@ -131,9 +135,6 @@ function addJitter(vsync) {
   }, jitter, by("vsync"));
   plot.setData(jitter);
 }
-export const axisColour = () => (matchMedia("(prefers-color-scheme: dark)").matches ? "#9aa4b0" : "#5a6470");
-export const gridColour = () => (matchMedia("(prefers-color-scheme: dark)").matches ? "#343a42" : "#e3e6ea");
-
 async function check() {
   by("checked").hidden = false;
   by("checked").className = "checked";
@@ -156,8 +157,10 @@ async function start() {
 
 /** Shows the newest live picture of the chosen name, as soon as it comes. */
 async function watchPictures() {
-  let [names, chosen, sequence] = [{}, null, 0];
-  const picture = new Picture(by("live-picture"), { label: "Live picture" });
+  let [names, chosen, sequence, shown] = [{}, null, 0, null];
+  const delays = startDelays();
+  const onpixel = (row, column) => delays(nameOf(shown), row, column);
+  const picture = new Picture(by("live-picture"), { label: "Live picture", onpixel });
   picture.element.hidden = true;
   const wait = (seconds) => new Promise((done) => { setTimeout(done, 1000 * seconds); });
   const choose = (name) => {
@@ -183,6 +186,9 @@ async function watchPictures() {
         picture.element.hidden = false;
         by("live-none").hidden = true;
         picture.show(newest);
+        // What the run has stored since belongs to the plot too.
+        shown = newest.about.session;
+        if (picture.at) onpixel(...picture.at);
         by("live-about").textContent = describe(newest);
       } else if (!newest) {
         await wait(chosen && !document.hidden ? 0.05 : 1);

@@ -2,7 +2,7 @@
 
 import { by, call } from "./main.js";
 import { Picture, element, fetchPicture, number, paint } from "./picture.js";
-import { axisColour, gridColour } from "./run.js";
+import { axisColour, gridColour } from "./plots.js";
 
 const nameOf = (folder) => folder.split("/").pop();
 const address = (session, rest = "") => `session/${encodeURIComponent(session)}${rest}`;

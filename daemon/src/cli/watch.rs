@@ -1,0 +1,119 @@
+//! Watches the run in progress, across a restart of the daemon.
+
+use std::path::{Path, PathBuf};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use raysweep_proto::{Client, ClientError, ErrorCode, Event, RpcError, RunState, Status, Subscription};
+
+use super::exit::Exit;
+use super::failure::CommandFailure;
+use super::follow::{Interrupts, OnInterrupt, follow};
+use super::printer::Printer;
+use super::view::EventView;
+
+/// Interval between attempts to reach a daemon that is gone.
+const RETRY: Duration = Duration::from_millis(500);
+/// How long a daemon that came back may take to go on with a run by itself (`raysweep resume --auto`).
+const RESUMES_WITHIN: Duration = Duration::from_secs(10);
+
+/// Watches until the run has ended. A daemon that goes away is waited for.
+pub(super) fn watch(socket: &Path, printer: Printer) -> Result<Exit, CommandFailure> {
+    let mut interrupts = Interrupts::new().map_err(CommandFailure::Signals)?;
+    let mut seat = Seat::take(socket)?;
+    let Some(mut session) = under_way(&seat.status) else {
+        let message = "no run in progress; `raysweep sessions` lists earlier runs";
+        return Err(ClientError::Rpc(RpcError::new(ErrorCode::NotRunning, message)).into());
+    };
+    let mut view = EventView::new(printer);
+    loop {
+        seat.say_what_was_said(&mut view)?;
+        match follow(seat.events, &session, &mut interrupts, &mut view, OnInterrupt::Leave) {
+            Err(CommandFailure::Client(ClientError::Lost { .. })) => {}
+            ended => return ended,
+        }
+        view.clear();
+        view.note("the daemon is gone; waiting until it is back, Ctrl-C ends this");
+        seat = loop {
+            if interrupts.pending() {
+                return Ok(Exit::Done);
+            }
+            match Seat::take(socket) {
+                Ok(seat) => break seat,
+                Err(refused @ ClientError::Permission { .. }) => return Err(refused.into()),
+                Err(_) => thread::sleep(RETRY),
+            }
+        };
+        match seat.await_run(&mut interrupts)? {
+            Some(goes_on) => session = goes_on,
+            None => return over(socket, &session, printer),
+        }
+    }
+}
+
+/// A connection for the daemon's events, and its status when it was made.
+struct Seat {
+    events: Subscription,
+    status: Status,
+}
+
+impl Seat {
+    fn take(socket: &Path) -> Result<Self, ClientError> {
+        let events = Client::connect(socket)?.subscribe()?;
+        Ok(Self { events, status: Client::connect(socket)?.status()? })
+    }
+
+    /// Shows what was said before anybody watched.
+    fn say_what_was_said(&self, view: &mut EventView) -> Result<(), CommandFailure> {
+        let Status { state, session, progress, vsync, viewfinder, question, .. } = self.status.clone();
+        let said = [
+            Some(Event::State { state, session }),
+            progress.map(Event::Progress),
+            viewfinder.map(Event::Viewfinder),
+            question.map(|text| Event::Ask { text }),
+            vsync.map(Event::Vsync),
+        ];
+        said.into_iter().flatten().try_for_each(|event| view.show(&event)).map_err(CommandFailure::Output)
+    }
+
+    /// The session of the run with which a daemon that came back goes on, if it does so soon.
+    fn await_run(&mut self, interrupts: &mut Interrupts) -> Result<Option<PathBuf>, CommandFailure> {
+        let began = Instant::now();
+        while began.elapsed() < RESUMES_WITHIN && !interrupts.pending() {
+            if let Some(session) = under_way(&self.status) {
+                return Ok(Some(session));
+            }
+            if let Some(Event::State { state, session }) = self.events.next_within(RETRY)? {
+                (self.status.state, self.status.session) = (state, session);
+            }
+        }
+        Ok(None)
+    }
+}
+
+/// The session of the run in progress.
+fn under_way(status: &Status) -> Option<PathBuf> {
+    let is_over = matches!(status.state, RunState::Idle | RunState::Faulted);
+    status.session.clone().filter(|_| !is_over)
+}
+
+/// What became of a run whose end nobody saw.
+fn over(socket: &Path, session: &Path, printer: Printer) -> Result<Exit, CommandFailure> {
+    let listed = Client::connect(socket)?.sessions()?;
+    let Some(info) = listed.into_iter().find(|info| info.session == session) else {
+        return Err(CommandFailure::Client(ClientError::Rpc(RpcError::new(
+            ErrorCode::NotRunning,
+            format!("the daemon is back, but {} is not among its sessions", session.display()),
+        ))));
+    };
+    let is_complete = info.state == "complete";
+    printer.print(&info, |info| {
+        let name = session.file_name().unwrap_or_default().display();
+        let stored = format!("{}: {} of {} stored", info.state, info.stored, info.points);
+        let path = format!("session: {}", session.display());
+        let then = format!("`raysweep resume {name}` acquires the missing points");
+        let lines = if is_complete { vec![stored, path] } else { vec![stored, path, then] };
+        lines.join("\n")
+    })?;
+    Ok(if is_complete { Exit::Done } else { Exit::Incomplete })
+}
