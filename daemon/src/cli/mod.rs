@@ -20,6 +20,7 @@ mod resume;
 mod sessions;
 mod setup;
 mod show;
+mod thumbnails;
 mod view;
 mod viewfinder;
 mod watch;
@@ -172,8 +173,13 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             listed.retain(|session| filter.keeps(session));
             printer.print(&listed, |sessions| show::sessions(sessions))?;
         }
-        Command::Show { session } => {
-            printer.print(&SessionView::read(&folder_of(session, &socket))?, SessionView::text)?;
+        Command::Show { session, thumbnails } => {
+            let session = folder_of(session, &socket);
+            let mut view = SessionView::read(&session)?;
+            if let Some(folder) = thumbnails {
+                view.thumbnails = thumbnails::write(&session, &folder)?;
+            }
+            printer.print(&view, SessionView::text)?;
         }
         Command::Diff { a, b, picture, product } => {
             let (a, b) = (folder_of(a, &socket), folder_of(b, &socket));

@@ -102,6 +102,8 @@ pub(super) struct SessionView {
     products: Vec<PathBuf>,
     /// Pictures that any program shows.
     pictures: Vec<PathBuf>,
+    /// Small pictures, if they were asked for.
+    pub thumbnails: Vec<PathBuf>,
 }
 
 impl SessionView {
@@ -144,6 +146,7 @@ impl SessionView {
             products: with_ending("npy"),
             // Of a video, the first.
             pictures: with_ending("png").into_iter().filter(|path| path.ends_with("0000.png")).collect(),
+            thumbnails: Vec::new(),
         })
     }
 
@@ -185,7 +188,9 @@ impl SessionView {
             title = "";
         }
         rows.extend(self.report.iter().map(|report| ("report", report.display().to_string())));
-        for (key, paths) in [("products", &self.products), ("pictures", &self.pictures)] {
+        let files =
+            [("products", &self.products), ("pictures", &self.pictures), ("thumbnails", &self.thumbnails)];
+        for (key, paths) in files {
             title = key;
             for path in paths {
                 rows.push((title, path.display().to_string()));

@@ -72,6 +72,12 @@ fn a_session_is_shown_on_one_screen_with_its_remarks() {
     assert!(shown.find("fingerprint") < shown.find("wiped it"), "oldest first: {shown}");
     let shown: Value = serde_json::from_str(&done(&["show", text(&session), "--json"])).unwrap();
     assert_eq!(shown["remarks"][1]["text"], "wiped it");
+    let thumbnails = data.path().join("thumbnails");
+    let shown = done(&["show", text(&session), "--thumbnails", text(&thumbnails), "--json"]);
+    let shown: Value = serde_json::from_str(&shown).unwrap();
+    let listed: Vec<&str> = shown["thumbnails"].as_array().unwrap().iter().filter_map(Value::as_str).collect();
+    assert!(listed.contains(&text(&thumbnails.join("epipolar.png"))), "{listed:?}");
+    assert!(listed.iter().all(|path| fs::read(path).unwrap().starts_with(b"\x89PNG")));
     // A remark is under the ledger's checksums, and changes nothing else.
     let (_, audit) = Audit::of(&Session::open(&session).unwrap()).unwrap();
     assert!(audit.damage.is_empty(), "{:?}", audit.damage);

@@ -125,7 +125,12 @@ impl Picture {
 
     /// A grey picture for a contact sheet.
     pub fn thumbnail(image: ArrayView2<f32>, tone_map: ToneMap) -> Picture {
-        Picture::new(image.insert_axis(Axis(2)), tone_map, THUMBNAIL_MAX_PX)
+        Picture::small(image.insert_axis(Axis(2)), tone_map)
+    }
+
+    /// A grey or colour picture of a linear image `[t, s, channels]` with one or three channels, as small as a thumbnail.
+    pub fn small(image: ArrayView3<f32>, tone_map: ToneMap) -> Picture {
+        Picture::new(image, tone_map, THUMBNAIL_MAX_PX)
     }
 
     /// Reduces an image to the size of a thumbnail, to keep it until its [`ToneMap`] is known:

@@ -1,6 +1,6 @@
 //! What the page shows of sessions on disk.
 
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
@@ -10,10 +10,9 @@ use raysweep_session::{Session, transport};
 use serde_json::{Value, json};
 
 use super::super::sessions::SessionView;
+use super::super::thumbnails::{about, pictures};
 use super::pictures::Encoded;
 
-/// Largest picture that is sent to a browser, in bytes: 4096 x 4096 values and the header of their file.
-const MOST_PICTURE_BYTES: u64 = (4 << 24) + (1 << 16);
 /// Largest report, in bytes.
 const MOST_REPORT_BYTES: u64 = 1 << 28;
 
@@ -24,36 +23,10 @@ fn told(error: impl std::fmt::Display) -> String {
 /// A session as `raysweep show --json` shows it, with the names of the products that are pictures.
 pub(super) fn session(folder: &Path) -> Result<Value, String> {
     let mut view = serde_json::to_value(SessionView::read(folder).map_err(told)?).map_err(told)?;
-    view["images"] = json!(images(folder)?);
     let session = Session::open(folder).map_err(told)?;
+    view["images"] = json!(pictures(&session));
     view["has_transport"] = json!(session.transport_path().exists());
     Ok(view)
-}
-
-/// Names of the products that are pictures, sorted.
-fn images(folder: &Path) -> Result<Vec<String>, String> {
-    let products = Session::open(folder).map_err(told)?.products_path();
-    let Ok(entries) = fs::read_dir(&products) else { return Ok(Vec::new()) };
-    let mut names: Vec<String> = entries
-        .flatten()
-        .map(|entry| entry.path())
-        .filter(|path| path.extension().is_some_and(|ending| ending == "npy"))
-        .filter(|path| path.metadata().is_ok_and(|file| file.len() <= MOST_PICTURE_BYTES))
-        .filter(|path| is_picture(&about(path)))
-        .filter_map(|path| Some(path.file_stem()?.to_str()?.to_owned()))
-        .collect();
-    names.sort();
-    Ok(names)
-}
-
-/// What is known of a product; null if nothing is.
-fn about(product: &Path) -> Value {
-    let text = fs::read(product.with_extension("json")).ok();
-    text.and_then(|text| serde_json::from_slice(&text).ok()).unwrap_or_default()
-}
-
-fn is_picture(about: &Value) -> bool {
-    [json!(["t", "s"]), json!(["t", "s", "rgb"])].contains(&about["axes"])
 }
 
 /// The report.
@@ -68,10 +41,11 @@ pub(super) fn report(folder: &Path) -> Result<Vec<u8>, String> {
 /// A product that is a picture.
 pub(super) fn picture(folder: &Path, product: &str) -> Result<Encoded, String> {
     // Names come from a browser: only those that exist are opened.
-    if !images(folder)?.iter().any(|name| name == product) {
+    let session = Session::open(folder).map_err(told)?;
+    if !pictures(&session).iter().any(|name| name == product) {
         return Err(format!("this session has no picture called {product:?}"));
     }
-    let products = Session::open(folder).map_err(told)?.products();
+    let products = session.products();
     let image = products.read_array(product).map_err(told)?;
     let about = about(&products.dir().join(format!("{product}.npy")));
     Ok(Encoded::new(image.view(), json!({ "name": product, "about": about })))

@@ -1,0 +1,65 @@
+//! The products of a session that are pictures, and small PNG files of them.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use ndarray::{Axis, Ix3};
+use raysweep_processing::ProcessError;
+use raysweep_session::report::{Picture, ToneMap};
+use raysweep_session::{Session, durable};
+use serde_json::{Value, json};
+
+use super::failure::CommandFailure;
+
+/// Largest picture, in bytes: 4096 x 4096 values and the header of their file.
+const MOST_PICTURE_BYTES: u64 = (4 << 24) + (1 << 16);
+/// The brightest half per cent of the pixels is white.
+const WHITE_PERCENT: f64 = 99.5;
+
+/// Names of the products that are pictures, sorted.
+pub(super) fn pictures(session: &Session) -> Vec<String> {
+    let Ok(entries) = fs::read_dir(session.products_path()) else { return Vec::new() };
+    let mut names: Vec<String> = entries
+        .flatten()
+        .map(|entry| entry.path())
+        .filter(|path| path.extension().is_some_and(|ending| ending == "npy"))
+        .filter(|path| path.metadata().is_ok_and(|file| file.len() <= MOST_PICTURE_BYTES))
+        .filter(|path| is_picture(&about(path)))
+        .filter_map(|path| Some(path.file_stem()?.to_str()?.to_owned()))
+        .collect();
+    names.sort();
+    names
+}
+
+/// What is known of a product; null if nothing is.
+pub(super) fn about(product: &Path) -> Value {
+    let text = fs::read(product.with_extension("json")).ok();
+    text.and_then(|text| serde_json::from_slice(&text).ok()).unwrap_or_default()
+}
+
+fn is_picture(about: &Value) -> bool {
+    [json!(["t", "s"]), json!(["t", "s", "rgb"])].contains(&about["axes"])
+}
+
+/// Writes a small PNG file of each picture of a session into `folder`, each with its own white; returns their paths.
+pub(super) fn write(session: &Path, folder: &Path) -> Result<Vec<PathBuf>, CommandFailure> {
+    let session = Session::open(session).map_err(ProcessError::from)?;
+    fs::create_dir_all(folder).map_err(|source| CommandFailure::Write { path: folder.to_owned(), source })?;
+    let mut written = Vec::new();
+    for name in pictures(&session) {
+        let image = session.products().read_array(&name).map_err(ProcessError::from)?;
+        let image = if image.ndim() == 2 { image.insert_axis(Axis(2)) } else { image };
+        // The dimensions in the file may contradict the names of the axes beside it.
+        let Ok(image) = image.into_dimensionality::<Ix3>() else { continue };
+        let planes: Vec<_> = image.axis_iter(Axis(2)).collect();
+        if ![1, 3].contains(&planes.len()) || image.is_empty() {
+            continue;
+        }
+        let white = ToneMap::percentile(&planes, WHITE_PERCENT);
+        let png = Picture::small(image.view(), white).to_png().map_err(ProcessError::from)?;
+        let path = folder.join(format!("{name}.png"));
+        durable::write(&path, &png).map_err(ProcessError::from)?;
+        written.push(path);
+    }
+    Ok(written)
+}
