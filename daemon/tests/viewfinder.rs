@@ -7,6 +7,7 @@ use std::process::{Command, Output, Stdio};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use nix::sys::signal::Signal;
 use raysweep::Probes;
 use raysweep::Runner;
 use raysweep::control::Control;
@@ -14,7 +15,7 @@ use raysweep::live::{LiveFile, LiveReader, VIEWFINDER};
 use raysweep::rig::{AnyRig, Devices, Rig};
 use raysweep_core::{DeviceError, FinderPicture, Pattern, Projector, Shown};
 use raysweep_processing::process as process_session;
-use raysweep_proto::{ErrorCode, Event, RunParams, RunState, ViewfinderParams, ViewfinderValues};
+use raysweep_proto::{Client, ErrorCode, Event, RunParams, RunState, ViewfinderParams, ViewfinderValues};
 use raysweep_session::Session;
 use raysweep_sim::{LensControl, LensOf, PlaneTruth};
 use tempfile::TempDir;
@@ -334,9 +335,14 @@ impl Program {
         program
     }
 
-    fn raysweep(&self, arguments: &[&str]) -> Output {
+    fn command(&self, arguments: &[&str]) -> Command {
         let mut command = Command::new(env!("CARGO_BIN_EXE_raysweep"));
-        command.current_dir(&self.folder).args(["--socket", "socket"]).args(arguments).output().unwrap()
+        command.current_dir(&self.folder).args(["--socket", "socket"]).args(arguments);
+        command
+    }
+
+    fn raysweep(&self, arguments: &[&str]) -> Output {
+        self.command(arguments).output().unwrap()
     }
 
     fn plan(&self, text: &str) {
@@ -412,4 +418,18 @@ fn a_scene_that_saturates_in_every_exposure_needs_less_light() {
         said.contains("even in the plan's shortest exposure, 600 us") && said.contains("close the aperture"),
         "{said}"
     );
+}
+
+#[test]
+fn a_viewfinder_ends_with_its_client_however_that_ends() {
+    for signal in [Signal::SIGINT, Signal::SIGTERM, Signal::SIGHUP] {
+        let program = Program::start(PLANE);
+        let mut client = Client::connect(program.folder.path().join("socket")).unwrap();
+        let mut command = program.command(&["viewfinder"]);
+        let mut viewfinder = process::Process::start(command.stdout(Stdio::null()).stderr(Stdio::null()));
+        process::wait_for("a picture", || client.status().unwrap().viewfinder);
+        viewfinder.signal(signal);
+        viewfinder.wait();
+        assert_eq!(client.status().unwrap().state, RunState::Idle, "{signal}");
+    }
 }

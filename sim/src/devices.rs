@@ -116,9 +116,21 @@ fn refusal(error: SimError) -> DeviceError {
     DeviceError::new("projector", kind, error)
 }
 
-/// VSYNC monitor and projector on the host's clock, with two handles to the camera: one writes settings while the other
+/// All devices of a rig but its camera.
+pub struct BenchDevices {
+    /// The VSYNC monitor.
+    pub vsync: Box<dyn Vsync>,
+    /// The projector, initially dark.
+    pub projector: Box<dyn Projector>,
+    /// What is in front of the camera, initially the scene.
+    pub subject: SubjectSwitch,
+    /// Ground truth of the line, for tests only.
+    pub truth: TruthProbe,
+}
+
+/// The devices on the host's clock, with two handles to the camera: one writes settings while the other
 /// waits for frames.
-pub type Shared = ([PlaneCamera; 2], Box<dyn Vsync>, Box<dyn Projector>, TruthProbe);
+pub type Shared = ([PlaneCamera; 2], BenchDevices);
 
 /// The devices of [`open`] on the host's clock.
 pub fn open_shared(world: &Arc<PlaneWorld>, line: VsyncLine) -> Shared {
@@ -126,8 +138,9 @@ pub fn open_shared(world: &Arc<PlaneWorld>, line: VsyncLine) -> Shared {
     let camera = || PlaneCamera::new(world.clone(), line.clone(), clock.register());
     let cameras = [camera(), camera()];
     let vsync = Box::new(SimVsync { line: line.clone(), clock: clock.register() });
-    let projector = Box::new(SimProjector { world: world.clone(), line: line.clone(), clock });
-    (cameras, vsync, projector, TruthProbe(line))
+    let projector = Box::new(SimProjector { world: world.clone(), line: line.clone(), clock: clock.clone() });
+    let subject = subject_switch(world.clone(), line.clone(), clock);
+    (cameras, BenchDevices { vsync, projector, subject, truth: TruthProbe(line) })
 }
 
 pub struct PlaneCamera {

@@ -27,7 +27,7 @@ pub mod usb;
 mod wire;
 mod world;
 
-pub use devices::{PlaneDevices, TruthProbe};
+pub use devices::{BenchDevices, PlaneDevices, TruthProbe};
 pub use error::SimError;
 pub use line::LineTruth;
 pub use rig::{LensControl, LensOf, PlaneRig};

@@ -39,11 +39,10 @@ fn run(arguments: &SimCameraArguments) -> Result<(), Box<dyn std::error::Error>>
     let sim = rig
         .simulated()
         .ok_or("no device of the rig file has the driver `sim`, and it names no `sim.bench`")?;
-    let WireDevices { camera, vsync, projector, truth } = sim.open_for_wire();
+    let WireDevices { camera, bench: devices } = sim.open_for_wire();
     let camera = Arc::new(GigeCamera::start(&setup, camera)?);
     let bench = rig.file.sim.bench.as_deref();
-    let _bench =
-        bench.map(|path| BenchServer::start(path, vsync, projector, truth, camera.clone())).transpose()?;
+    let _bench = bench.map(|path| BenchServer::start(path, devices, camera.clone())).transpose()?;
     announce(arguments);
     wait_for_ever()
 }

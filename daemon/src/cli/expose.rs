@@ -153,7 +153,7 @@ struct Trial {
 impl Trial {
     fn begin(socket: &Path) -> Result<Self, CommandFailure> {
         let events = Client::connect(socket)?.subscribe()?;
-        let interrupts = Interrupts::new().map_err(CommandFailure::Signals)?;
+        let interrupts = Interrupts::of_any_end().map_err(CommandFailure::Signals)?;
         let mut client = Client::connect(socket)?;
         client.run(&RunParams { plan: VIEWFINDER.into(), ..RunParams::default() })?;
         let mut trial = Self { client, events, interrupts, pictures: 0 };

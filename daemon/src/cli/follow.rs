@@ -1,8 +1,10 @@
 //! Follows a run to its end.
 
+use std::future::poll_fn;
 use std::io::{self, IsTerminal};
 use std::os::fd::AsFd;
 use std::path::Path;
+use std::task::{Context, Poll};
 use std::time::Duration;
 
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
@@ -25,34 +27,46 @@ pub(super) enum OnInterrupt {
     Leave,
 }
 
-/// Catches Ctrl-C instead of letting it end the process.
+/// Catches signals instead of letting them end the process.
 pub(super) struct Interrupts {
     /// Driven only by [`Interrupts::pending`].
     runtime: Runtime,
-    signal: Signal,
+    signals: Vec<Signal>,
 }
 
 impl Interrupts {
-    /// From here on, SIGINT no longer ends the process.
-    pub fn new() -> io::Result<Self> {
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build()?;
-        let signal = {
-            let _within = runtime.enter();
-            signal(SignalKind::interrupt())?
-        };
-        Ok(Self { runtime, signal })
+    /// From here on, Ctrl-C no longer ends the process.
+    pub fn of_operator() -> io::Result<Self> {
+        Self::of(&[SignalKind::interrupt()])
     }
 
-    /// Whether Ctrl-C was pressed since the last call.
+    /// From here on, neither Ctrl-C nor the end of the terminal nor SIGTERM ends the process: for runs that are of no
+    /// use without us, and would leave the light on.
+    pub fn of_any_end() -> io::Result<Self> {
+        Self::of(&[SignalKind::interrupt(), SignalKind::hangup(), SignalKind::terminate()])
+    }
+
+    fn of(kinds: &[SignalKind]) -> io::Result<Self> {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build()?;
+        let signals = {
+            let _within = runtime.enter();
+            kinds.iter().map(|kind| signal(*kind)).collect::<io::Result<_>>()?
+        };
+        Ok(Self { runtime, signals })
+    }
+
+    /// Whether Ctrl-C was pressed, or another of the signals came, since the last call.
     pub fn pending(&mut self) -> bool {
-        let Self { runtime, signal } = self;
+        let Self { runtime, signals } = self;
         runtime.block_on(async {
             // Yielding lets the runtime poll for signals.
-            tokio::select! {
-                biased;
-                _ = signal.recv() => true,
-                () = tokio::task::yield_now() => false,
-            }
+            tokio::task::yield_now().await;
+            let came = |context: &mut Context<'_>| {
+                let came = signals.iter_mut().map(|signal| signal.poll_recv(context).is_ready());
+                // Each is asked, so that none stays pending.
+                Poll::Ready(came.fold(false, |any, came| any | came))
+            };
+            poll_fn(came).await
         })
     }
 }

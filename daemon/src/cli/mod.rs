@@ -99,17 +99,26 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             printer.print(&report, show::design)?;
         }
         Command::Run(RunArguments { plan, about }) => {
-            return run(&socket, printer, &plan, &read_plan(&plan)?, about);
+            return run(&socket, printer, &plan, &read_plan(&plan)?, about, Interrupts::of_operator);
         }
         Command::Calibrate { plan: Some(plan), about } => {
-            return run(&socket, printer, &plan, &read_plan(&plan)?, about);
+            return run(&socket, printer, &plan, &read_plan(&plan)?, about, Interrupts::of_operator);
         }
         Command::Calibrate { plan: None, about } => {
-            return run(&socket, printer, Path::new("calibrate"), calibration::PLAN, about);
+            return run(
+                &socket,
+                printer,
+                Path::new("calibrate"),
+                calibration::PLAN,
+                about,
+                Interrupts::of_operator,
+            );
         }
         Command::Expose { plan } => return expose::expose(&socket, &plan, printer),
         Command::Viewfinder(arguments) => match change_or_plan(&socket, &arguments)? {
-            Wanted::Plan(path, text) => return run(&socket, printer, &path, &text, arguments.about),
+            Wanted::Plan(path, text) => {
+                return run(&socket, printer, &path, &text, arguments.about, Interrupts::of_any_end);
+            }
             Wanted::Changed => return changed(printer),
         },
         Command::Calibration(command) => return calibration::calibration(&socket, command, printer),
@@ -126,7 +135,9 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             };
             // The daemon's working directory is another: what exists here is named in full.
             let session = fs::canonicalize(&session).unwrap_or(session);
-            return begin_run(&socket, printer, detach, |client| Ok(client.resume(&session)?));
+            return begin_run(&socket, printer, detach, Interrupts::of_operator, |client| {
+                Ok(client.resume(&session)?)
+            });
         }
         Command::Watch => return watch::watch(&socket, printer),
         Command::Preview { output, follow } => {
@@ -280,10 +291,11 @@ fn run(
     path: &Path,
     text: &str,
     about: RunDescription,
+    interrupts: fn() -> io::Result<Interrupts>,
 ) -> Result<Exit, CommandFailure> {
     let RunDescription { detach, operator, sample, note, tags } = about;
     let params = RunParams { plan: text.to_owned(), operator, sample, note, tags };
-    begin_run(socket, printer, detach, |client| {
+    begin_run(socket, printer, detach, interrupts, |client| {
         client.run(&params).map_err(|error| CommandFailure::of_plan(error, path, text))
     })
 }
@@ -292,7 +304,7 @@ fn run(
 fn rerun(socket: &Path, printer: Printer, session: &Path, detach: bool) -> Result<Exit, CommandFailure> {
     let params = sessions::run_again(session)?;
     let plan = session.join("plan.toml");
-    begin_run(socket, printer, detach, |client| {
+    begin_run(socket, printer, detach, Interrupts::of_operator, |client| {
         let started =
             client.run(&params).map_err(|error| CommandFailure::of_plan(error, &plan, &params.plan))?;
         let said = match sessions::changes(session, &started.session) {
@@ -311,6 +323,7 @@ fn begin_run(
     socket: &Path,
     printer: Printer,
     detach: bool,
+    interrupts: fn() -> io::Result<Interrupts>,
     begin: impl FnOnce(&mut Client) -> Result<Started, CommandFailure>,
 ) -> Result<Exit, CommandFailure> {
     let mut client = Client::connect(socket)?;
@@ -321,7 +334,7 @@ fn begin_run(
     }
     // Before the run begins, so that none of its events is missed, and no Ctrl-C ends us with the run unattended.
     let events = Client::connect(socket)?.subscribe()?;
-    let mut interrupts = Interrupts::new().map_err(CommandFailure::Signals)?;
+    let mut interrupts = interrupts().map_err(CommandFailure::Signals)?;
     let Started { session } = begin(&mut client)?;
     let mut view = EventView::new(printer);
     follow(events, &session, &mut interrupts, &mut view, OnInterrupt::Cancel(client))

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use raysweep_proto::{Client, RunState, ViewfinderParams};
+use raysweep_proto::{Client, ClientError, ErrorCode, RpcError, RunState, ViewfinderParams};
 
 use super::arguments::ViewfinderArguments;
 use super::exit::Exit;
@@ -40,7 +40,11 @@ pub(super) fn change_or_plan(
     let status = client.status()?;
     let is_over = matches!(status.state, RunState::Idle | RunState::Faulted);
     if let (false, Some(_), None) = (is_over, &status.viewfinder, &arguments.plan) {
-        let ViewfinderArguments { picture, region, exposure_us, .. } = *arguments;
+        let ViewfinderArguments { picture, region, exposure_us, board, seconds, .. } = *arguments;
+        if board || seconds.is_some() {
+            let message = "a viewfinder runs, and --board and --seconds are for one that begins: end it with `raysweep cancel` first";
+            return Err(ClientError::Rpc(RpcError::new(ErrorCode::Busy, message)).into());
+        }
         client.viewfinder(&ViewfinderParams { picture, region, exposure_us })?;
         return Ok(Wanted::Changed);
     }

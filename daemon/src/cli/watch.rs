@@ -19,7 +19,7 @@ const RESUMES_WITHIN: Duration = Duration::from_secs(10);
 
 /// Watches until the run has ended. A daemon that goes away is waited for.
 pub(super) fn watch(socket: &Path, printer: Printer) -> Result<Exit, CommandFailure> {
-    let mut interrupts = Interrupts::new().map_err(CommandFailure::Signals)?;
+    let mut interrupts = Interrupts::of_operator().map_err(CommandFailure::Signals)?;
     let mut seat = Seat::take(socket)?;
     let Some(mut session) = under_way(&seat.status) else {
         let message = "no run in progress; `raysweep sessions` lists earlier runs";

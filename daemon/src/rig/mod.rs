@@ -321,11 +321,12 @@ impl Rig {
             ProjectorDriver::Sim => simulated.projector().map(|projector| (projector, None)),
         };
         // Real devices use the host's clock, even if others of the rig are simulated.
-        let real = |camera| (camera, Clock::real(), Stand::Operator);
+        let real =
+            |camera: Result<Box<dyn Camera>, RigError>| Ok((camera?, Clock::real(), simulated.stand()?));
         let camera = match self.file.camera.driver {
             CameraDriver::Sim => simulated.camera_and_stand(),
-            CameraDriver::Aravis => self.open_aravis().map(real),
-            CameraDriver::V4l2 => self.open_v4l2().map(real),
+            CameraDriver::Aravis => real(self.open_aravis()),
+            CameraDriver::V4l2 => real(self.open_v4l2()),
         };
         let by_the_clock = self.file.sim.realtime || self.file.camera.driver != CameraDriver::Sim;
         let pace = if by_the_clock { Pace::Devices } else { Pace::Pipeline };

@@ -7,7 +7,7 @@ use raysweep_config::RigFile;
 use raysweep_config::rig::plane::CameraDriver;
 use raysweep_core::{Camera, Clock, DeviceError, Pattern, Projector, Shown, Vsync};
 use raysweep_drivers::projector::external::External;
-use raysweep_sim::bench::{RemoteProjector, RemoteVsync};
+use raysweep_sim::bench::{RemoteProjector, RemoteVsync, remote_subject};
 use raysweep_sim::{PlaneDevices, PlaneRig, PlaneSetup, SimError, SubjectSwitch};
 
 use super::{Rig, RigError, Stand};
@@ -63,6 +63,14 @@ impl Simulated {
         let both = camera.zip(subject).ok_or_else(|| not_simulated("camera"))?;
         let ((camera, clock), subject) = both;
         Ok((camera, clock, Stand::Simulated(subject)))
+    }
+
+    /// What places subjects in front of a camera that this process does not simulate.
+    pub(super) fn stand(&self) -> Result<Stand, RigError> {
+        Ok(match &self.bench {
+            Some(bench) => Stand::Simulated(remote_subject(bench)?),
+            None => Stand::Operator,
+        })
     }
 
     /// The watcher of the VSYNC line.

@@ -75,7 +75,8 @@ fn a_session_is_shown_on_one_screen_with_its_remarks() {
     let thumbnails = data.path().join("thumbnails");
     let shown = done(&["show", text(&session), "--thumbnails", text(&thumbnails), "--json"]);
     let shown: Value = serde_json::from_str(&shown).unwrap();
-    let listed: Vec<&str> = shown["thumbnails"].as_array().unwrap().iter().filter_map(Value::as_str).collect();
+    let listed: Vec<&str> =
+        shown["thumbnails"].as_array().unwrap().iter().filter_map(Value::as_str).collect();
     assert!(listed.contains(&text(&thumbnails.join("epipolar.png"))), "{listed:?}");
     assert!(listed.iter().all(|path| fs::read(path).unwrap().starts_with(b"\x89PNG")));
     // A remark is under the ledger's checksums, and changes nothing else.

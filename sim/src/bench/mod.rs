@@ -6,10 +6,10 @@
 mod remote;
 mod server;
 
-use raysweep_core::{DeviceErrorKind, Pattern};
+use raysweep_core::{DeviceErrorKind, Pattern, Subject};
 use serde::{Deserialize, Serialize};
 
-pub use remote::{BenchProbe, RemoteProjector, RemoteVsync};
+pub use remote::{BenchProbe, RemoteProjector, RemoteVsync, remote_subject};
 pub use server::{BenchError, BenchServer};
 
 use crate::gige::{Faults, WireTruth};
@@ -28,6 +28,8 @@ enum Request {
     Show(Pattern),
     /// Switch the light off.
     Blank,
+    /// Place something in front of the camera.
+    Place(Subject),
     /// Get the ground truth so far.
     Truth,
     /// Get the current faults.
@@ -44,6 +46,8 @@ enum Reply {
     Edge { seq: u64, host_ns: i64 },
     /// Earliest time at which the light shows what was requested.
     Shown { not_before_ns: i64 },
+    /// It is in front of the camera.
+    Placed(Subject),
     /// The answer to [`Request::Truth`].
     Truth(Truth),
     /// The active faults.

@@ -3,12 +3,14 @@
 use std::io::{BufRead, BufReader, ErrorKind, Read, Write};
 use std::os::unix::net::UnixStream;
 use std::path::Path;
+use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use raysweep_core::{DeviceError, DeviceErrorKind, Edge, Pattern, Projector, Shown, Vsync};
 
 use super::{MAX_LINE, Reply, Request, Truth};
 use crate::gige::Faults;
+use crate::subject::SubjectSwitch;
 
 /// Longest wait for an answer: a new pattern takes the bench a moment to compute.
 const ANSWER: Duration = Duration::from_secs(10);
@@ -131,6 +133,22 @@ impl Projector for RemoteProjector {
     fn blank(&mut self) -> Result<Shown, DeviceError> {
         self.shown(&Request::Blank)
     }
+}
+
+/// Changes what is in front of the bench's camera, over a connection of its own.
+///
+/// # Errors
+/// `Disconnected` when there is no bench.
+pub fn remote_subject(path: &Path) -> Result<SubjectSwitch, DeviceError> {
+    let connection = Mutex::new(Connection::open("subject", path)?);
+    Ok(SubjectSwitch::new(move |subject| {
+        // A connection on which something panicked is still one.
+        let mut connection = connection.lock().unwrap_or_else(PoisonError::into_inner);
+        match connection.ask(&Request::Place(subject))? {
+            Reply::Placed(_) => Ok(()),
+            reply => Err(connection.unexpected(&reply)),
+        }
+    }))
 }
 
 /// Reads a bench's ground truth and sets its faults, for tests only.

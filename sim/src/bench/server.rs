@@ -10,11 +10,12 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
-use raysweep_core::{DeviceErrorKind, Edge, Projector, Vsync};
+use raysweep_core::{DeviceErrorKind, Edge, Projector, Shown, Vsync};
 
 use super::{MAX_LINE, Reply, Request, Truth};
-use crate::devices::TruthProbe;
+use crate::devices::{BenchDevices, TruthProbe};
 use crate::gige::GigeCamera;
+use crate::subject::SubjectSwitch;
 
 /// Longest wait for a client or an edge, and so the longest delay of a stop.
 const PATIENCE: Duration = Duration::from_millis(50);
@@ -47,6 +48,7 @@ pub struct BenchServer {
 /// State shared by all clients.
 struct Bench {
     projector: Mutex<Box<dyn Projector>>,
+    subject: SubjectSwitch,
     truth: TruthProbe,
     camera: Arc<GigeCamera>,
     /// Clients subscribed to edges.
@@ -55,21 +57,17 @@ struct Bench {
 }
 
 impl BenchServer {
-    /// Serves VSYNC line and projector at `path`, for use with a separate camera.
+    /// Serves these devices at `path`, for use with a separate camera.
     ///
     /// # Errors
     /// When the socket cannot be created at `path`.
-    pub fn start(
-        path: &Path,
-        vsync: Box<dyn Vsync>,
-        projector: Box<dyn Projector>,
-        truth: TruthProbe,
-        camera: Arc<GigeCamera>,
-    ) -> Result<Self, BenchError> {
+    pub fn start(path: &Path, devices: BenchDevices, camera: Arc<GigeCamera>) -> Result<Self, BenchError> {
+        let BenchDevices { vsync, projector, subject, truth } = devices;
         let listener = listen(path).map_err(|source| BenchError::Listen { path: path.to_owned(), source })?;
         let mut server = Self { path: path.to_owned(), stop: Arc::default(), threads: Vec::new() };
         let bench = Arc::new(Bench {
             projector: Mutex::new(projector),
+            subject,
             truth,
             camera,
             watchers: Mutex::default(),
@@ -173,9 +171,11 @@ impl Bench {
     }
 
     fn answer(&self, request: Request) -> Reply {
-        let shown = match request {
-            Request::Show(pattern) => lock(&self.projector).show(&pattern),
-            Request::Blank => lock(&self.projector).blank(),
+        let shown = |Shown { not_before_ns }| Reply::Shown { not_before_ns };
+        let answer = match request {
+            Request::Show(pattern) => lock(&self.projector).show(&pattern).map(shown),
+            Request::Blank => lock(&self.projector).blank().map(shown),
+            Request::Place(subject) => self.subject.place(subject).map(|()| Reply::Placed(subject)),
             Request::SetFaults(faults) => {
                 self.camera.set_faults(faults);
                 return Reply::Faults(faults);
@@ -185,10 +185,7 @@ impl Bench {
                 return Reply::Truth(Truth { line: self.truth.read(), wire: self.camera.truth() });
             }
         };
-        match shown {
-            Ok(shown) => Reply::Shown { not_before_ns: shown.not_before_ns },
-            Err(error) => Reply::Error { kind: error.kind, message: error.source.to_string() },
-        }
+        answer.unwrap_or_else(|error| Reply::Error { kind: error.kind, message: error.source.to_string() })
     }
 }
 

@@ -13,11 +13,12 @@ use std::time::Duration;
 use raysweep_config::sim::SimConfig;
 use raysweep_config::sim::{SimProjector, SimSensor, SimVsync};
 use raysweep_core::{
-    CameraSettings, Clock, FramePool, Pattern, PixelFormat, Projector, Raster, SettingsId, Shutter, Vsync,
+    CameraSettings, Clock, FramePool, Pattern, PixelFormat, Projector, Raster, SettingsId, Shutter, Subject,
+    Vsync,
 };
-use raysweep_sim::bench::{BenchProbe, BenchServer, RemoteProjector, RemoteVsync};
+use raysweep_sim::bench::{BenchProbe, BenchServer, RemoteProjector, RemoteVsync, remote_subject};
 use raysweep_sim::gige::{CameraClock, Faults, GigeCamera, GigeSetup, Look, test_pixel};
-use raysweep_sim::{PlaneRig, PlaneSetup, WireDevices};
+use raysweep_sim::{BenchDevices, PlaneRig, PlaneSetup, WireDevices};
 
 use self::client::Client;
 
@@ -92,7 +93,7 @@ fn expected(settings: CameraSettings) -> Vec<u16> {
 
 /// Starts the rig's camera, triggered by VSYNC, with the projector lit.
 fn lit(test: u8, rig: &PlaneRig, faults: Faults) -> (GigeCamera, Client, Box<dyn Vsync>) {
-    let WireDevices { camera, vsync, mut projector, .. } = rig.open_for_wire();
+    let WireDevices { camera, bench: BenchDevices { vsync, mut projector, .. } } = rig.open_for_wire();
     let camera = GigeCamera::start(&setup(test, faults), camera).unwrap();
     let shown = projector.show(&Pattern::White).unwrap();
     while Clock::real().now_ns() < shown.not_before_ns {
@@ -320,12 +321,12 @@ fn a_camera_that_died_comes_back_as_nobodys() {
 #[test]
 fn vsync_and_projector_reach_another_process() {
     let rig = rig(|_| {});
-    let WireDevices { camera, vsync, projector, truth } = rig.open_for_wire();
+    let WireDevices { camera, bench } = rig.open_for_wire();
     let camera = Arc::new(GigeCamera::start(&setup(8, Faults::default()), camera).unwrap());
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("bench.sock");
     assert!(RemoteVsync::open(&path).is_err());
-    let server = BenchServer::start(&path, vsync, projector, truth, camera.clone()).unwrap();
+    let server = BenchServer::start(&path, bench, camera.clone()).unwrap();
     let mut edges = RemoteVsync::open(&path).unwrap();
     let mut light = RemoteProjector::open(&path).unwrap();
     let mut probe = BenchProbe::open(&path).unwrap();
@@ -353,6 +354,14 @@ fn vsync_and_projector_reach_another_process() {
     let dark = brightest_after(light.blank().unwrap());
     assert_eq!(dark, 64, "black level");
     assert!(half > dark && white > half, "{white} {half} {dark}");
+    let subject = remote_subject(&path).unwrap();
+    subject.place(Subject::Cap).unwrap();
+    assert_eq!(brightest_after(light.show(&Pattern::White).unwrap()), 64, "a cap lets no light through");
+    subject.place(Subject::Scene).unwrap();
+    assert!(brightest_after(light.show(&Pattern::White).unwrap()) > half);
+    let error = subject.place(Subject::Diffuser).unwrap_err();
+    assert!(error.to_string().contains("a plane rig has"), "{error}");
+
     let error = light.show(&Pattern::Rows(vec![1.0; 3])).unwrap_err();
     assert!(error.to_string().contains("3 rows"), "{error}");
 

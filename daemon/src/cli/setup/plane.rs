@@ -38,7 +38,7 @@ pub(super) fn ask(questions: &mut Questions, connected: &ConnectedDevices) -> Re
         "first_row_us",
         "Microseconds from the VSYNC edge to the first row (`raysweep calibrate` measures it)",
         rounded(LINES_BEFORE * row_time_us).min(period_us),
-        0.0..=period_us,
+        0.0..=rounded(period_us),
     )?;
     let text = camera.write(RigText::new("plane"));
     let text = write_vsync(text.table("vsync"), &vsync, period_us, questions)?;

@@ -216,8 +216,11 @@ impl Questions {
 /// One line of the person at the terminal; nothing stands for the default.
 fn asked(prompt: &str, default: Option<&str>) -> Answer<String> {
     let shown = default.filter(|default| !default.is_empty());
-    let default_text = shown.map_or(String::new(), |default| format!(" [{default}]"));
-    print!("{}{default_text}: ", prompt.trim_end());
+    let default_text = shown.map_or(String::new(), |default| format!("[{default}]"));
+    let prompt = prompt.trim_end();
+    // Below a list, the answer has a line of its own.
+    let gap = if prompt.contains('\n') { "\n" } else { " " };
+    print!("{prompt}{gap}{default_text}: ");
     io::stdout().flush().map_err(CommandFailure::Output)?;
     let mut line = String::new();
     let read = io::stdin().lock().read_line(&mut line);
