@@ -55,11 +55,10 @@ fn observe(faults: &str) -> (Counts, Truth) {
     let delay_us = rig.raster().delay_us(0, 500.0 + capabilities.trigger_latency_us, 300.0);
     let mut counts = Counts::default();
     let mut push = |event| {
-        assembler.push(event, |decision| {
-            let (Decision::Failed(_, _, account) | Decision::Flushed(account, _)) = decision else {
-                panic!("a unit")
-            };
-            counts.add(&account);
+        assembler.push(event, |decision| match decision {
+            Decision::Failed(_, _, account) | Decision::Flushed(account, _) => counts.add(&account),
+            Decision::UnderWay(_) => {}
+            Decision::Unit(_) => panic!("a unit"),
         });
     };
     push(DeviceEvent::Begin(Job {
