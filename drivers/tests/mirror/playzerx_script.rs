@@ -45,6 +45,8 @@ struct Desk {
     most_held: u64,
     /// Sent before each answer.
     noise: &'static [u8],
+    /// How it goes on once its FIFO is cleared, if not as before.
+    once_cleared: Option<Drain>,
 }
 
 impl Desk {
@@ -79,6 +81,7 @@ impl Desk {
             }
             b'c' => {
                 (self.base, self.asked) = (self.sent, 0);
+                self.drain = self.once_cleared.take().unwrap_or(self.drain);
                 return Vec::new();
             }
             b'n' => INFO.to_vec(),
@@ -109,6 +112,7 @@ impl Lab {
             asked: 0,
             most_held: 0,
             noise: b"",
+            once_cleared: None,
         }));
         let answering = desk.clone();
         let answer = move |message: &[u8], now_ns| answering.lock().unwrap().answer(message, now_ns);
@@ -224,24 +228,12 @@ fn parking_empties_the_fifo_and_ramps_from_the_sample_that_the_count_tells() {
         assert!(began.elapsed() < Duration::from_secs(60));
         std::thread::sleep(Duration::from_millis(1));
     }
-    // The controller stops with 3000 samples left.
+    // The controller stops with 3000 samples left, and works again when it is parked.
+    lab.desk.lock().unwrap().once_cleared = Some(Drain::ByClock(1000.0));
     lab.drain(Drain::Holds(3000));
-    let parking = std::thread::spawn(move || mirror.park().map(|()| mirror));
-    let began = Instant::now();
-    let clearing = loop {
-        if let Some(at) = lab.frames().iter().position(|frame| frame == CLEAR) {
-            break at;
-        }
-        assert!(began.elapsed() < Duration::from_secs(60));
-        // Who looks without a rest keeps the controller from answering.
-        std::thread::sleep(Duration::from_millis(1));
-    };
-    {
-        let mut desk = lab.desk.lock().unwrap();
-        (desk.drain, desk.base) = (Drain::ByClock(1000.0), desk.sent);
-    }
-    parking.join().unwrap().unwrap();
+    mirror.park().unwrap();
     let frames = lab.frames();
+    let clearing = frames.iter().position(|frame| frame == CLEAR).unwrap();
     // The count is queried three times, since an answer may be lost; the ping shows that all queries have arrived.
     assert_eq!(frames[clearing - 3..clearing], [LEFT, LEFT, LEFT]);
     assert_eq!(frames[clearing + 1], PING);
@@ -283,28 +275,18 @@ fn a_controller_that_plays_nothing_is_told_by_its_count() {
         let now_ns = raysweep_core::Clock::real().now_ns();
         let left = desk.left(now_ns);
         desk.drain = Drain::Holds(left);
+        // When the driver parks after the error, the controller works again.
+        desk.once_cleared = Some(Drain::ByClock(1000.0));
         left
     };
     assert!(left > 1000);
-    let halted = std::thread::spawn(move || {
-        let error = loop {
-            if let Err(error) = mirror.feed() {
-                break error;
-            }
-            std::thread::sleep(Duration::from_millis(1));
-        };
-        (error, mirror)
-    });
-    // When the driver parks after the error, the controller works again.
-    while !lab.frames().iter().any(|frame| frame == CLEAR) {
+    let error = loop {
+        if let Err(error) = mirror.feed() {
+            break error;
+        }
         assert!(began.elapsed() < Duration::from_secs(60));
         std::thread::sleep(Duration::from_millis(1));
-    }
-    {
-        let mut desk = lab.desk.lock().unwrap();
-        (desk.drain, desk.base) = (Drain::ByClock(1000.0), desk.sent);
-    }
-    let (error, _mirror) = halted.join().unwrap();
+    };
     assert!(error.kind == DeviceErrorKind::Timeout && error.to_string().contains("no motion"), "{error}");
 }
 
