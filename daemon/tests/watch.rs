@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use daemon::{Daemon, end, plan};
+use nix::sys::signal::Signal;
 use process::{Process, wait_for};
 use raysweep_proto::RunState;
 use tempfile::TempDir;
@@ -17,7 +18,7 @@ use tempfile::TempDir;
 const RIG: &str = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver = \"sim\"\n\
                    [projector]\ndriver = \"sim\"\nrows = 8\n\
                    [sim]\nscene = \"v-groove\"\nscene_rows = 8\nscene_columns = 8\n";
-const PLAN: &str = "kind = \"sweep\"\nname = \"watched\"\n[sweep]\naverage = 300\n\
+const PLAN: &str = "kind = \"sweep\"\nname = \"watched\"\n[sweep]\naverage = 1000\n\
                     delay_us = [-60, 0, 60]\nexposure_us = [50, 100, 150]\n";
 
 fn folder() -> TempDir {
@@ -48,34 +49,46 @@ fn wait_until_said(folder: &Path, words: &str) {
     wait_for(words, || said().then_some(()));
 }
 
-#[test]
-fn a_run_is_watched_to_its_end_across_a_restart_of_the_daemon() {
+/// A daemon that was killed during a pause while it was watched: its folder, the session and the watcher.
+fn killed_while_watched() -> (TempDir, PathBuf, Process) {
     let folder = folder();
     let mut daemon = Daemon::start(folder.path());
     let session = paused(&mut daemon);
-    let mut watch = watch(folder.path());
+    let watch = watch(folder.path());
     wait_until_said(folder.path(), "paused");
     daemon.kill();
     wait_until_said(folder.path(), "the daemon is gone");
+    (folder, session, watch)
+}
+
+fn output(folder: &Path) -> String {
+    std::fs::read_to_string(folder.join("output")).unwrap()
+}
+
+#[test]
+fn a_run_is_watched_to_its_end_across_a_restart_of_the_daemon() {
+    let (folder, session, mut watch) = killed_while_watched();
     let mut daemon = Daemon::start(folder.path());
     let (_, state) = end(&mut daemon, |client| drop(client.resume(&session).unwrap()));
     assert_eq!(state, "complete");
     assert_eq!(watch.wait().code(), Some(0));
-    let output = std::fs::read_to_string(folder.path().join("output")).unwrap();
+    let output = output(folder.path());
     assert!(output.starts_with("complete: "), "{output}");
 }
 
 #[test]
 fn a_run_that_nobody_goes_on_with_is_said_to_be_incomplete() {
-    let folder = folder();
-    let mut daemon = Daemon::start(folder.path());
-    let session = paused(&mut daemon);
-    let mut watch = watch(folder.path());
-    wait_until_said(folder.path(), "paused");
-    daemon.kill();
+    let (folder, session, mut watch) = killed_while_watched();
     let _daemon = Daemon::start(folder.path());
     assert_eq!(watch.wait().code(), Some(3));
-    let output = std::fs::read_to_string(folder.path().join("output")).unwrap();
     let name = session.file_name().unwrap().to_str().unwrap();
+    let output = output(folder.path());
     assert!(output.contains(&format!("`raysweep resume {name}`")), "{output}");
+}
+
+#[test]
+fn ctrl_c_ends_the_wait_for_a_daemon() {
+    let (_folder, _session, mut watch) = killed_while_watched();
+    watch.signal(Signal::SIGINT);
+    assert_eq!(watch.wait().code(), Some(0));
 }

@@ -136,7 +136,12 @@ fn run_assembler(mut assembler: Assembler, events: &Receiver<DeviceEvent>, dispa
     let mut seq = 0;
     for event in events {
         assembler.push(event, |decision| {
-            if dispatch.permits.recv().is_err() {
+            let has_permit = match decision {
+                // Nobody waits for progress: frames would be lost while the sink waits for its disk.
+                Decision::UnderWay(_) => dispatch.permits.try_recv().is_ok(),
+                _ => dispatch.permits.recv().is_ok(),
+            };
+            if !has_permit {
                 return;
             }
             dispatch.send(seq, decision);

@@ -6,13 +6,15 @@ use std::path::{Path, PathBuf};
 use ndarray::{Axis, Ix3};
 use raysweep_processing::ProcessError;
 use raysweep_session::report::{Picture, ToneMap};
-use raysweep_session::{Session, durable};
+use raysweep_session::{Session, durable, input};
 use serde_json::{Value, json};
 
 use super::failure::CommandFailure;
 
 /// Largest picture, in bytes: 4096 x 4096 values and the header of their file.
 const MOST_PICTURE_BYTES: u64 = (4 << 24) + (1 << 16);
+/// Largest description of a product.
+const MOST_ABOUT_BYTES: u64 = 1 << 24;
 /// The brightest half per cent of the pixels is white.
 const WHITE_PERCENT: f64 = 99.5;
 
@@ -23,7 +25,7 @@ pub(super) fn pictures(session: &Session) -> Vec<String> {
         .flatten()
         .map(|entry| entry.path())
         .filter(|path| path.extension().is_some_and(|ending| ending == "npy"))
-        .filter(|path| path.metadata().is_ok_and(|file| file.len() <= MOST_PICTURE_BYTES))
+        .filter(|path| path.metadata().is_ok_and(|it| it.is_file() && it.len() <= MOST_PICTURE_BYTES))
         .filter(|path| is_picture(&about(path)))
         .filter_map(|path| Some(path.file_stem()?.to_str()?.to_owned()))
         .collect();
@@ -33,7 +35,7 @@ pub(super) fn pictures(session: &Session) -> Vec<String> {
 
 /// What is known of a product; null if nothing is.
 pub(super) fn about(product: &Path) -> Value {
-    let text = fs::read(product.with_extension("json")).ok();
+    let text = input::read(&product.with_extension("json"), MOST_ABOUT_BYTES).ok();
     text.and_then(|text| serde_json::from_slice(&text).ok()).unwrap_or_default()
 }
 

@@ -34,21 +34,42 @@ pub(super) fn watch(socket: &Path, printer: Printer) -> Result<Exit, CommandFail
         }
         view.clear();
         view.note("the daemon is gone; waiting until it is back, Ctrl-C ends this");
-        seat = loop {
-            if interrupts.pending() {
-                return Ok(Exit::Done);
-            }
-            match Seat::take(socket) {
-                Ok(seat) => break seat,
-                Err(refused @ ClientError::Permission { .. }) => return Err(refused.into()),
-                Err(_) => thread::sleep(RETRY),
+        let found = loop {
+            let Some(back) = await_daemon(socket, &mut interrupts)? else { return Ok(Exit::Done) };
+            seat = back;
+            match seat.await_run(&mut interrupts) {
+                // It is gone again.
+                Err(ClientError::Lost { .. }) => {}
+                found => break found?,
             }
         };
-        match seat.await_run(&mut interrupts)? {
-            Some(goes_on) => session = goes_on,
-            None => return over(socket, &session, printer),
+        match found {
+            Found::GoesOn(run) => session = run,
+            Found::Nothing => return over(socket, &session, printer),
+            Found::Interrupted => return Ok(Exit::Done),
         }
     }
+}
+
+/// Waits until the daemon answers again; `None` after Ctrl-C.
+fn await_daemon(socket: &Path, interrupts: &mut Interrupts) -> Result<Option<Seat>, ClientError> {
+    while !interrupts.pending() {
+        match Seat::take(socket) {
+            Ok(seat) => return Ok(Some(seat)),
+            Err(refused @ ClientError::Permission { .. }) => return Err(refused),
+            Err(_) => thread::sleep(RETRY),
+        }
+    }
+    Ok(None)
+}
+
+/// What a daemon that came back does.
+enum Found {
+    /// It goes on with the run of this session.
+    GoesOn(PathBuf),
+    Nothing,
+    /// That was not waited for, because of Ctrl-C.
+    Interrupted,
 }
 
 /// A connection for the daemon's events, and its status when it was made.
@@ -76,18 +97,21 @@ impl Seat {
         said.into_iter().flatten().try_for_each(|event| view.show(&event)).map_err(CommandFailure::Output)
     }
 
-    /// The session of the run with which a daemon that came back goes on, if it does so soon.
-    fn await_run(&mut self, interrupts: &mut Interrupts) -> Result<Option<PathBuf>, CommandFailure> {
+    /// Whether a daemon that came back goes on with a run soon.
+    fn await_run(&mut self, interrupts: &mut Interrupts) -> Result<Found, ClientError> {
         let began = Instant::now();
-        while began.elapsed() < RESUMES_WITHIN && !interrupts.pending() {
+        while began.elapsed() < RESUMES_WITHIN {
+            if interrupts.pending() {
+                return Ok(Found::Interrupted);
+            }
             if let Some(session) = under_way(&self.status) {
-                return Ok(Some(session));
+                return Ok(Found::GoesOn(session));
             }
             if let Some(Event::State { state, session }) = self.events.next_within(RETRY)? {
                 (self.status.state, self.status.session) = (state, session);
             }
         }
-        Ok(None)
+        Ok(Found::Nothing)
     }
 }
 

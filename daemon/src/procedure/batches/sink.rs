@@ -257,10 +257,7 @@ impl BatchWriter {
         let attributes = attributes.as_object().cloned().unwrap_or_default();
         let written = self.writing.dots.write(batch, &stored, attributes);
         match written.and_then(|()| self.writing.ledger.append(&Entry::Batch(entry.clone()))) {
-            Ok(()) => {
-                self.progress.stored += 1;
-                self.progress.counts.add(&counts);
-            }
+            Ok(()) => self.progress.point_stored(&counts),
             Err(error) => {
                 tracing::error!(%error, batch, "batch not stored");
                 self.fail(error);
