@@ -163,7 +163,7 @@ impl SessionView {
         if !self.tags.is_empty() {
             rows.push(("tags", self.tags.join(", ")));
         }
-        rows.push(("state", format!("{}: {} of {} stored", self.state, self.stored, self.points)));
+        rows.push(("state", format!("{}: {} of {} points stored", self.state, self.stored, self.points)));
         rows.extend(self.error.iter().map(|error| ("error", error.clone())));
         let Counts { expected, averaged, .. } = self.counts;
         rows.push(("frames", format!("{averaged} used of {expected}, {}", self.counts.losses())));
@@ -272,7 +272,7 @@ impl Compared {
             rows.push((
                 which,
                 format!(
-                    "{stored} of {points} stored, {averaged} frames used of {expected}, {}",
+                    "{stored} of {points} points stored, {averaged} frames used of {expected}, {}",
                     counts.losses()
                 ),
             ));

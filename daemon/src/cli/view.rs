@@ -193,7 +193,7 @@ impl EventView {
             }
             Place::Lines { told } if told.is_none_or(|told| told.elapsed() >= PACE) => {
                 *told = Some(Instant::now());
-                eprintln!("{stored} stored  {pace}  {all}");
+                eprintln!("{stored} stored, with dark images  {pace}  {all}");
             }
             Place::Lines { .. } | Place::Quiet | Place::Json => {}
         }

@@ -133,7 +133,7 @@ fn over(socket: &Path, session: &Path, printer: Printer) -> Result<Exit, Command
     let is_complete = info.state == "complete";
     printer.print(&info, |info| {
         let name = session.file_name().unwrap_or_default().display();
-        let stored = format!("{}: {} of {} stored", info.state, info.stored, info.points);
+        let stored = format!("{}: {} of {} points stored", info.state, info.stored, info.points);
         let path = format!("session: {}", session.display());
         let then = format!("`raysweep resume {name}` acquires the missing points");
         let lines = if is_complete { vec![stored, path] } else { vec![stored, path, then] };

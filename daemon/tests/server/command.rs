@@ -43,7 +43,7 @@ fn json_lines(text: &str) -> Vec<Value> {
 fn a_run_is_followed_to_its_end_and_the_exit_code_tells_how_it_went() {
     let daemon = Daemon::start();
     for (text, code, wanted) in
-        [("", 0, "complete: 75 of 75 stored, 0 missing"), ("gaps", 3, "2 missing"), ("fault", 1, "faulted")]
+        [("", 0, "complete: 75 of 75 points stored, 0 missing"), ("gaps", 3, "2 missing"), ("fault", 1, "faulted")]
     {
         let (exit, out, err) = run(&daemon, &["run", &plan(&daemon, text)]);
         assert_eq!(exit, code, "{text}: {out}{err}");

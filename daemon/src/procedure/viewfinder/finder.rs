@@ -29,10 +29,23 @@ pub struct Finder {
     pixels: Array2<u16>,
     focus: FocusMeter,
     values: ViewfinderValues,
+    rhythm: Rhythm,
+    ends: Option<Instant>,
+}
+
+/// When the next picture is due.
+struct Rhythm {
     /// Time from picture to picture.
     pace: Duration,
     next: Instant,
-    ends: Option<Instant>,
+}
+
+impl Rhythm {
+    /// Notes that a picture is shown. The next one is due by the rhythm and not by this picture, or a camera as fast as
+    /// the rhythm would lose each frame that jitter makes early; where pictures come late, nothing is made up for.
+    fn shown(&mut self, now: Instant) {
+        self.next = (self.next + self.pace).max(now);
+    }
 }
 
 /// What a finder must know of its rig.
@@ -83,8 +96,7 @@ impl Finder {
                 dot: None,
                 problem: None,
             },
-            pace: Duration::from_secs_f64(1.0 / plan.pictures_per_s),
-            next: now,
+            rhythm: Rhythm { pace: Duration::from_secs_f64(1.0 / plan.pictures_per_s), next: now },
             ends: plan.seconds.map(|seconds| now + Duration::from_secs_f64(seconds)),
         }
     }
@@ -96,7 +108,7 @@ impl Finder {
 
     /// How long it is until the next picture is due.
     pub fn time_to_next(&self) -> Duration {
-        self.next.saturating_duration_since(Instant::now())
+        self.rhythm.next.saturating_duration_since(Instant::now())
     }
 
     /// What is shown.
@@ -155,7 +167,7 @@ impl Finder {
 
     /// Measures the picture unpacked last and publishes it.
     pub fn show(&mut self) {
-        self.next = Instant::now() + self.pace;
+        self.rhythm.shown(Instant::now());
         let Self { pixels, values, .. } = self;
         let region = region_of(pixels.view(), values.region);
         let Levels { saturated, underexposed, mean_dn, brightest_dn, histogram } =
@@ -248,5 +260,37 @@ mod tests {
         pixels[[1, 3]] = 4001;
         let expected = ndarray::arr2(&[[5.5, 4001.0], [20.5, 22.5]]);
         assert_eq!(reduced(pixels.view(), 2, 4000.0), expected);
+    }
+
+    /// Times in ms at which frames that come at these times are shown.
+    fn shown(frames_ms: impl Iterator<Item = f64>, pace_ms: f64) -> Vec<f64> {
+        let began = Instant::now();
+        let mut rhythm = Rhythm { pace: Duration::from_secs_f64(pace_ms / 1e3), next: began };
+        let mut shown = Vec::new();
+        for frame_ms in frames_ms {
+            let now = began + Duration::from_secs_f64(frame_ms / 1e3);
+            if now >= rhythm.next {
+                rhythm.shown(now);
+                shown.push(frame_ms);
+            }
+        }
+        shown
+    }
+
+    #[test]
+    fn a_camera_as_fast_as_the_rhythm_loses_no_frame_to_jitter() {
+        let jitter_ms = |frame: u32| f64::from(frame * 7919 % 11) / 5.0 - 1.0;
+        let frames = (1..=150).map(|frame| 66.667 * f64::from(frame) + jitter_ms(frame));
+        assert!(shown(frames, 66.667).len() >= 149);
+    }
+
+    #[test]
+    fn a_faster_camera_is_shown_at_the_rhythm_and_a_pause_is_not_made_up_for() {
+        let frames = (0..600).map(|frame| f64::from(frame) * 16.667);
+        let pauses = frames.filter(|ms| !(2000.0..4000.0).contains(ms));
+        let shown = shown(pauses, 66.667);
+        let after = |begin: f64| shown.iter().filter(|ms| (begin..begin + 1000.0).contains(*ms)).count();
+        assert!((14..=16).contains(&after(0.0)), "{shown:?}");
+        assert!((15..=17).contains(&after(4000.0)), "{shown:?}");
     }
 }
