@@ -13,7 +13,11 @@ use std::process::{Command, Output, Stdio};
 
 use nix::pty::openpty;
 use process::{Process, wait_for};
+use raysweep_core::Subject;
 use raysweep_proto::{Client, DoctorReport, Event, Grade, RunParams};
+use raysweep_session::Session;
+use raysweep_session::stack::ArrayName;
+use raysweep_sim::bench::remote_subject;
 use raysweep_sim::mirror::{MirrorPty, PlayzerXController, PlayzerXControllerConfig, SerialLink, WireFaults};
 use raysweep_sim::triggerbox::TriggerBoxPty;
 use serde_json::Value;
@@ -72,13 +76,20 @@ fn a_rig_set_up_from_answers_is_sound_and_runs_the_papers_sweep() {
     let _daemon = Process::start(command.arg("--data").arg(rig.path("data")).stderr(Stdio::null()));
     let mut client = wait_for("the daemon does not listen", || Client::connect(&socket).ok());
     let events = Client::connect(&socket).unwrap().subscribe().unwrap();
+    // What an earlier run left in front of the bench's camera is not what this one is about.
+    remote_subject(&rig.path("bench.sock")).unwrap().place(Subject::Board).unwrap();
     let plan = include_str!("../../deploy/plans/paper.toml");
     client.run(&RunParams { plan: plan.into(), ..RunParams::default() }).unwrap();
     let ended = events.into_iter().find_map(|event| match event.unwrap() {
-        Event::Finished { state, missing, error, .. } => Some((state, missing, error)),
+        Event::Finished { session, state, missing, error, .. } => Some((session, (state, missing, error))),
         _ => None,
     });
-    assert_eq!(ended, Some(("complete".into(), 0, None)));
+    let (session, ended) = ended.unwrap();
+    assert_eq!(ended, ("complete".into(), 0, None));
+    let stack = Session::open(&session).unwrap().stack().unwrap();
+    let regular = stack.read_point(ArrayName::Regular, 0).unwrap().mapv(f64::from);
+    let (mean, most) = (regular.mean().unwrap(), regular.fold(0.0_f64, |most, light| most.max(*light)));
+    assert!(most > 1.3 * mean, "an even board, not the scene: {mean} on average, at most {most}");
 }
 
 #[test]
@@ -123,6 +134,7 @@ fn wrong_answers_write_nothing_and_name_what_is_allowed() {
         ("camera = 'sim'\nprojector = 'sim'\nvsync = 'sim'\nrow_time_us = 900", "do not go together"),
         ("camera = 'sim'\nprojector = 'sim'\nvsync = 'sim'\nprojector_rows = 1.5", "whole numbers"),
         ("camera = ", "answers.toml"),
+        ("camera = 'sim'\nask_ports = ['132']", "ask_ports: 132: there is no such file"),
         ("kind = 'dots'\ncamera = 'sim'\nmirror = 'optotune:/dev/null'", "laser_port is missing"),
     ] {
         let output = setup(folder.path(), answers);

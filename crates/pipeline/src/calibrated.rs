@@ -5,8 +5,10 @@ use ndarray::ArrayView3;
 use raysweep_transport::plane::calibrate::{Sample, latency, spike_offset};
 use raysweep_transport::plane::{RowTiming, Setting};
 
-/// A latency found further from the calibration's causes a warning.
+/// A latency found further from the calibration's, beyond doubt, causes a warning.
 const NEAR_US: f64 = 2.0;
+/// Standard errors within which a latency may be off by chance.
+const DOUBT: f64 = 2.0;
 /// One still further is not adopted: the rig, or something before it, has moved.
 const ADOPTED_US: f64 = 5.0;
 /// Direct light further from its place causes a warning.
@@ -63,7 +65,7 @@ impl CalibrationDrift {
                 } else {
                     self.late_us = late_us;
                     self.late_sd_us = Some(found.standard_error_us);
-                    if late_us.abs() > NEAR_US {
+                    if late_us.abs() > NEAR_US + DOUBT * found.standard_error_us {
                         self.warnings.push(format!("{comes}: calibrate again soon"));
                     }
                 }

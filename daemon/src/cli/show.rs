@@ -333,7 +333,11 @@ impl Ending<'_> {
     /// Text for the end of a run.
     pub(super) fn text(&self) -> String {
         let Self { session, state, report, stored, missing, final_s, light_s } = *self;
-        let mut lines = vec![format!("{state}: {stored} of {} points stored, {missing} missing", stored + missing)];
+        let mut lines = vec![match stored + missing {
+            // A viewfinder stores nothing.
+            0 => state.to_owned(),
+            points => format!("{state}: {stored} of {points} points stored, {missing} missing"),
+        }];
         lines.push(format!("session: {}", session.display()));
         lines.extend(
             light_s.map(|seconds| format!("{seconds:.2} s from the first to the last frame with light")),

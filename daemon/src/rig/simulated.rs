@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use raysweep_config::RigFile;
 use raysweep_config::rig::plane::CameraDriver;
-use raysweep_core::{Camera, Clock, DeviceError, Pattern, Projector, Shown, Vsync};
+use raysweep_core::{Camera, Clock, DeviceError, Pattern, Projector, Shown, Subject, Vsync};
 use raysweep_drivers::projector::external::External;
 use raysweep_sim::bench::{RemoteProjector, RemoteVsync, remote_subject};
 use raysweep_sim::{PlaneDevices, PlaneRig, PlaneSetup, SimError, SubjectSwitch};
@@ -65,12 +65,13 @@ impl Simulated {
         Ok((camera, clock, Stand::Simulated(subject)))
     }
 
-    /// What places subjects in front of a camera that this process does not simulate.
+    /// What places subjects in front of a camera that this process does not simulate. On a bench, which outlives runs,
+    /// each begins with the scene there, as on a rig that this process simulates.
     pub(super) fn stand(&self) -> Result<Stand, RigError> {
-        Ok(match &self.bench {
-            Some(bench) => Stand::Simulated(remote_subject(bench)?),
-            None => Stand::Operator,
-        })
+        let Some(bench) = &self.bench else { return Ok(Stand::Operator) };
+        let subject = remote_subject(bench)?;
+        subject.place(Subject::Scene)?;
+        Ok(Stand::Simulated(subject))
     }
 
     /// The watcher of the VSYNC line.

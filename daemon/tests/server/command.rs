@@ -42,9 +42,11 @@ fn json_lines(text: &str) -> Vec<Value> {
 #[test]
 fn a_run_is_followed_to_its_end_and_the_exit_code_tells_how_it_went() {
     let daemon = Daemon::start();
-    for (text, code, wanted) in
-        [("", 0, "complete: 75 of 75 points stored, 0 missing"), ("gaps", 3, "2 missing"), ("fault", 1, "faulted")]
-    {
+    for (text, code, wanted) in [
+        ("", 0, "complete: 75 of 75 points stored, 0 missing"),
+        ("gaps", 3, "2 missing"),
+        ("fault", 1, "faulted"),
+    ] {
         let (exit, out, err) = run(&daemon, &["run", &plan(&daemon, text)]);
         assert_eq!(exit, code, "{text}: {out}{err}");
         assert!(out.contains(wanted) && out.contains(session().to_str().unwrap()), "{text}: {out}");

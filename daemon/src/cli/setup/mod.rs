@@ -92,14 +92,13 @@ fn ask_ports(
     connected: &mut ConnectedDevices,
     is_spoken: bool,
 ) -> Result<(), CommandFailure> {
-    let ports: Vec<String> =
-        connected.serial_ports.iter().map(|port| port.path.display().to_string()).collect();
-    let chosen = questions.choose_many(
+    let ports: Vec<PathBuf> = connected.serial_ports.iter().map(|port| port.path.clone()).collect();
+    let chosen = questions.paths(
         "ask_ports",
         "Ask serial ports for mirror controllers and triggerboxes? That resets some boards, and may confuse other devices, so name only ports whose device you know to be one of these",
         &ports,
     )?;
-    for port in chosen.into_iter().map(PathBuf::from) {
+    for port in chosen {
         let answer = ask(&port);
         if is_spoken {
             println!("{}: {}", port.display(), answer_text(answer.as_ref()));

@@ -140,11 +140,13 @@ impl Questions {
         allowed: RangeInclusive<u32>,
     ) -> Answer<u32> {
         let (first, last) = (*allowed.start(), *allowed.end());
-        let value = self.number(key, question, f64::from(default), f64::from(first)..=f64::from(last))?;
-        match value.fract() == 0.0 {
-            true => Ok(value as u32),
-            false => {
-                refused(format!("{}{key} = {value}; allowed: whole numbers, {first} to {last}", self.place()))
+        let allowed = format!("allowed: whole numbers, {first} to {last}");
+        loop {
+            let value = self.number(key, question, f64::from(default), f64::from(first)..=f64::from(last))?;
+            match self {
+                _ if value.fract() == 0.0 => return Ok(value as u32),
+                Self::File { .. } => return refused(format!("{}{key} = {value}; {allowed}", self.place())),
+                Self::Terminal => println!("{value} is no whole number; {allowed}"),
             }
         }
     }
@@ -158,25 +160,44 @@ impl Questions {
         asked(&format!("{question}\n"), Some(default))
     }
 
-    /// Asks which of `choices` to take, none by default.
-    pub fn choose_many(&mut self, key: &str, question: &str, choices: &[String]) -> Answer<Vec<String>> {
+    /// Asks which paths to take, none by default; `choices` are those that were found.
+    pub fn paths(&mut self, key: &str, question: &str, choices: &[PathBuf]) -> Answer<Vec<PathBuf>> {
+        let missing = |paths: &[PathBuf]| paths.iter().find(|path| !path.exists()).cloned();
         if let Self::File { .. } = self {
             let strings = |value: &Value| {
                 let values = value.as_array()?.iter();
-                values.map(|value| value.as_str().map(str::to_owned)).collect::<Option<Vec<_>>>()
+                values.map(|value| value.as_str().map(PathBuf::from)).collect::<Option<Vec<_>>>()
             };
-            return Ok(self.given(key, "a list of strings", strings)?.unwrap_or_default());
+            let paths = self.given(key, "a list of strings", strings)?.unwrap_or_default();
+            return match missing(&paths) {
+                Some(path) => refused(format!(
+                    "{}{key}: {}: there is no such file; allowed: paths of serial ports, such as /dev/ttyUSB0",
+                    self.place(),
+                    path.display()
+                )),
+                None => Ok(paths),
+            };
         }
         if choices.is_empty() {
             return Ok(Vec::new());
         }
-        let prompt = format!("{question}\n  {}\n", choices.join("\n  "));
-        let line = asked(&format!("{prompt}all, none, or paths separated by spaces"), Some("none"))?;
-        Ok(match line.as_str() {
-            "none" => Vec::new(),
-            "all" => choices.to_vec(),
-            paths => paths.split_whitespace().map(str::to_owned).collect(),
-        })
+        let allowed = "all, none, or paths separated by spaces";
+        let listed: Vec<String> = choices.iter().map(|path| path.display().to_string()).collect();
+        let mut prompt = format!("{question}\n  {}\n{allowed}", listed.join("\n  "));
+        loop {
+            let line = asked(&prompt, Some("none"))?;
+            let paths: Vec<PathBuf> = match line.as_str() {
+                "none" => Vec::new(),
+                "all" => choices.to_vec(),
+                paths => paths.split_whitespace().map(PathBuf::from).collect(),
+            };
+            match missing(&paths) {
+                Some(path) => {
+                    prompt = format!("{}: there is no such file; allowed: {allowed}\n", path.display())
+                }
+                None => return Ok(paths),
+            }
+        }
     }
 
     /// Ends the questions.
