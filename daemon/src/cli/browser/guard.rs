@@ -25,19 +25,21 @@ pub(super) struct Guard {
 impl Guard {
     /// Why a request is refused; `None` if it is not.
     fn refusal(&self, path: &str, headers: &HeaderMap) -> Option<&'static str> {
-        let host = headers.get(header::HOST).and_then(|host| host.to_str().ok()).unwrap_or_default();
         let hosts = ["127.0.0.1", "localhost"].map(|name| format!("{name}:{}", self.port));
         // A name that another server resolves to this machine (DNS rebinding) is not this address.
-        if !hosts.iter().any(|known| known == host) {
+        let is_known = |host: &HeaderValue| hosts.iter().any(|known| known.as_bytes() == host.as_bytes());
+        let mut asked = headers.get_all(header::HOST).iter();
+        if !asked.next().is_some_and(is_known) || !asked.all(is_known) {
             return Some("open the page at the address that `raysweep view` printed");
         }
         let token = path.trim_start_matches('/').split('/').next().unwrap_or_default();
         if !is_equal(token.as_bytes(), self.token.as_bytes()) {
             return Some("the address lacks the token that `raysweep view` printed");
         }
-        let is_foreign = headers.get(header::ORIGIN).is_some_and(|origin| {
-            !hosts.iter().any(|host| origin.as_bytes() == format!("http://{host}").as_bytes())
-        });
+        let is_foreign = headers
+            .get_all(header::ORIGIN)
+            .iter()
+            .any(|origin| !hosts.iter().any(|host| origin.as_bytes() == format!("http://{host}").as_bytes()));
         is_foreign.then_some("pages of other addresses may not use this one")
     }
 }
@@ -91,5 +93,9 @@ mod tests {
         ] {
             assert!(refusal(path, host, origin).is_some(), "{path} {host} {origin:?}");
         }
+        let two = ["127.0.0.1:8000", "example.org"].map(|host| (header::HOST, host.parse().unwrap()));
+        let mut headers = HeaderMap::new();
+        two.into_iter().for_each(|(name, host)| drop(headers.append(name, host)));
+        assert!(guard.refusal("/0123abcd/", &headers).is_some(), "two hosts");
     }
 }
