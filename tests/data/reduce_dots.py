@@ -29,7 +29,9 @@ def main(still, planes, out_still, out_planes):
     white, direct = still["white"].mean(2), still["direct"].mean(2)
     share = np.where(white > 0, direct / np.maximum(white, 1e-9), 0).astype(np.float32)
     uv = np.array([[(c + 0.5) / SIDE, (r + 0.5) / SIDE] for r, c in scan], np.float32)
-    np.savez_compressed(out_still, T=reduced(still["T"].astype(np.float32).mean(3)), uv=uv, direct_share=share)
+    dots = reduced(still["T"].astype(np.float32).mean(3))
+    sums = dots.astype(np.float32).sum(0)
+    np.savez_compressed(out_still, T=dots, uv=uv, direct_share=share, white=sums)
     np.savez_compressed(out_planes, far=reduced(planes["far"]), near=reduced(planes["near"]))
 
 

@@ -6,7 +6,7 @@
 //! | `words` | uint32 | `[word]` | pixel / 32 of 32 consecutive pixels of the frame, ascending within each dot |
 //! | `masks` | uint32 | `[word]` | which of these pixels the dot has: bit `b` is pixel `32 word + b` |
 //! | `values` | float32 | `[pixel]` | their light, in the order of dots, words and bits |
-//! | `residual` | float32 | `[dot, block row, block column]` | mean light of the other pixels of each 32 x 32 block |
+//! | `residual` | float32 | `[dot, block row, block column]` | mean light of the other pixels of each block; a block has `width / block columns` rows and columns |
 //! | `discs` | uint32 | `[dot]` | discs used by the denoising; 0: nothing above the background |
 //! | `capped` | bool | `[dot]` | whether the denoising stopped at the maximum number of discs |
 //! | `seen` | bool | `[dot]` | whether the dot has a frame that shows the scene; the others have no light |
@@ -34,9 +34,6 @@ use crate::{Error, Result};
 
 pub use self::flat::FlatArrays;
 
-/// Side length of a residual block in pixels.
-const BLOCK_PX: usize = 32;
-
 /// The columns of one batch; the fields are the arrays of its group.
 #[derive(Debug, Clone, Default, PartialEq)]
 #[allow(missing_docs, reason = "the table at the head of the module says what each is")]
@@ -46,6 +43,8 @@ pub struct BatchColumns {
     pub masks: Vec<u32>,
     pub values: Vec<f32>,
     pub residual: Vec<f32>,
+    /// Number of rows and columns of a residual's block; no array of its own, but in the shape of `residual`.
+    pub block_px: usize,
     pub discs: Vec<u32>,
     pub capped: Vec<bool>,
     pub seen: Vec<bool>,
@@ -100,8 +99,8 @@ pub struct Dots {
     dir: PathBuf,
     /// Frames per batch.
     dots: usize,
-    /// Number of block rows and block columns.
-    blocks: [usize; 2],
+    /// Rows and columns of a frame.
+    size: [usize; 2],
 }
 
 impl Dots {
@@ -114,7 +113,6 @@ impl Dots {
             "height": shape.rows,
             "width": shape.columns,
             "dots": shape.dots(),
-            "block_px": BLOCK_PX,
             "units": "camera counts (DN) above the background, times the flat field's gain",
         });
         zarr::create_group(&DurableStore::new(dir)?, into_map(attributes))?;
@@ -123,8 +121,7 @@ impl Dots {
 
     /// Uses the existing group at `dir`.
     pub fn open(dir: &Path, shape: &StackShape) -> Self {
-        let blocks = [shape.rows.div_ceil(BLOCK_PX), shape.columns.div_ceil(BLOCK_PX)];
-        Self { dir: dir.to_owned(), dots: shape.dots(), blocks }
+        Self { dir: dir.to_owned(), dots: shape.dots(), size: [shape.rows, shape.columns] }
     }
 
     fn path_of(&self, batch: usize) -> PathBuf {
@@ -138,7 +135,8 @@ impl Dots {
     /// [`Error::Shape`] if the arrays do not match the number of dots and blocks; [`Error::Io`] or
     /// [`Error::Zarr`] if the file system refuses.
     pub fn write(&self, batch: usize, columns: &BatchColumns, attributes: Map<String, Value>) -> Result<()> {
-        let (dots, [rows, across]) = (self.dots, self.blocks);
+        let dots = self.dots;
+        let [rows, across] = self.size.map(|side| side.div_ceil(columns.block_px.max(1)));
         let lengths = [
             ("word_offsets", columns.word_offsets.len(), dots + 1),
             ("masks", columns.masks.len(), columns.words.len()),
@@ -183,12 +181,22 @@ impl Dots {
             return Err(Error::io("read", &path)(missing));
         }
         let get = Get { store: DurableStore::new(&path)? };
+        let residual = get.shape("residual", 3)?;
+        let width = self.size[1];
+        let Some(block_px) = width.checked_div(residual[2]).filter(|side| side * residual[2] == width) else {
+            return Err(Error::Shape {
+                what: format!("residual of batch {batch}"),
+                found: residual,
+                allowed: format!("[dots, block rows, block columns], of which {width} is a multiple"),
+            });
+        };
         Ok(BatchColumns {
             word_offsets: get.array("word_offsets", 1)?,
             words: get.array("words", 1)?,
             masks: get.array("masks", 1)?,
             values: get.array("values", 1)?,
             residual: get.array("residual", 3)?,
+            block_px,
             discs: get.array("discs", 1)?,
             capped: get.array("capped", 1)?,
             seen: get.array("seen", 1)?,
@@ -334,6 +342,11 @@ struct Get {
 }
 
 impl Get {
+    fn shape(&self, name: &str, axes: usize) -> Result<Vec<usize>> {
+        let array = zarr::open_array(&self.store, name, axes)?;
+        Ok(zarr::shape_of(&array))
+    }
+
     fn array<T: ElementOwned>(&self, name: &str, axes: usize) -> Result<Vec<T>> {
         let array = zarr::open_array(&self.store, name, axes)?;
         if zarr::shape_of(&array).contains(&0) {
@@ -381,6 +394,7 @@ mod tests {
             masks: vec![1, u32::MAX, 1 << 31],
             values: (0..34).map(|value| value as f32 - 3.5).collect(),
             residual: (0..12).map(|block| block as f32 / 8.0).collect(),
+            block_px: 32,
             discs: vec![2, 0, 1],
             capped: vec![true, false, false],
             seen: vec![true, false, true],
@@ -394,6 +408,9 @@ mod tests {
         dots.write(1, &columns(5), Map::new()).unwrap();
         dots.write(1, &columns(0), Map::new()).unwrap();
         let dots = Dots::open(dir.path(), &shape());
+        let finer = BatchColumns { block_px: 16, residual: vec![0.5; 36], ..columns(3) };
+        dots.write(2, &finer, Map::new()).unwrap();
+        assert_eq!(dots.read(2).unwrap(), finer);
         let read = dots.read(1).unwrap();
         assert_eq!((&read, read.crc32()), (&columns(0), columns(0).crc32()));
         assert!(read.crc32() != columns(5).crc32());
@@ -401,7 +418,7 @@ mod tests {
         let names = fs::read_dir(dir.path()).unwrap().map(|entry| entry.unwrap().file_name());
         let mut names: Vec<_> = names.map(|name| name.into_string().unwrap()).collect();
         names.sort();
-        assert_eq!(names, ["b0001", "zarr.json"], "nothing else is left");
+        assert_eq!(names, ["b0001", "b0002", "zarr.json"], "nothing else is left");
     }
 
     #[test]
@@ -414,6 +431,7 @@ mod tests {
             masks: Vec::new(),
             values: Vec::new(),
             residual: vec![0.0; 12],
+            block_px: 32,
             discs: vec![0; 3],
             capped: vec![false; 3],
             seen: vec![false; 3],
@@ -448,6 +466,8 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let dots = Dots::create(dir.path(), &shape()).unwrap();
         let torn = BatchColumns { seen: vec![true; 2], ..columns(0) };
+        let finer = BatchColumns { block_px: 16, ..columns(0) };
+        assert!(dots.write(0, &finer, Map::new()).is_err(), "12 means are not those of 16 x 16 pixels");
         let error = dots.write(0, &torn, Map::new()).unwrap_err();
         assert!(
             matches!(&error, Error::Shape { found, allowed, .. } if found == &[2] && allowed == "[3]"),

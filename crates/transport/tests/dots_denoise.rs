@@ -207,10 +207,12 @@ fn columns_and_residuals_hold_all_light() {
         let sound = frame.iter().zip(&gain).enumerate().filter(|(pixel, _)| !hot.contains(pixel));
         expected += sound.map(|(_, (&raw, &gain))| (f64::from(raw) - 100.3) * f64::from(gain)).sum::<f64>();
         let column = batch.column(index);
-        let mut outside = vec![1024.0; shape.blocks()];
+        let side = shape.block_px();
+        assert_eq!((side, shape.block_columns()), (16, 12));
+        let mut outside = vec![(side * side) as f64; shape.blocks()];
         for (pixel, value) in column.pixels() {
             sparse += f64::from(value[0]);
-            outside[pixel / 192 / 32 * 6 + pixel % 192 / 32] -= 1.0;
+            outside[pixel / 192 / side * 12 + pixel % 192 / side] -= 1.0;
         }
         kept +=
             column.residual().iter().zip(&outside).map(|(&mean, count)| f64::from(mean) * count).sum::<f64>();

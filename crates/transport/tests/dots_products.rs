@@ -28,7 +28,8 @@ fn column(shape: FrameShape, image: &Array3<f32>, least: f32) -> SparseColumn {
             *column.masks.last_mut().unwrap() |= 1 << (pixel % 32);
             column.values.extend(value);
         } else {
-            let block = pixel / shape.width() / 32 * (shape.width() / 32) + pixel % shape.width() / 32;
+            let side = shape.block_px();
+            let block = pixel / shape.width() / side * shape.block_columns() + pixel % shape.width() / side;
             for (channel, &value) in value.iter().enumerate() {
                 let (sum, count) = &mut rest[block * channels + channel];
                 (*sum, *count) = (*sum + f64::from(value), *count + 1);
@@ -56,7 +57,7 @@ fn dense(batch: &Batch) -> Vec<Array3<f64>> {
         let column = batch.column(dot);
         let mut image =
             Array3::from_shape_fn((shape.height(), shape.width(), shape.channels()), |(row, at, channel)| {
-                let block = row / 32 * (shape.width() / 32) + at / 32;
+                let block = row / shape.block_px() * shape.block_columns() + at / shape.block_px();
                 f64::from(column.residual()[block * shape.channels() + channel])
             });
         for (pixel, value) in column.pixels() {
@@ -312,11 +313,12 @@ fn masks_split_the_floodlit_image_as_dense_masks_do() {
 
 #[test]
 fn a_residual_is_direct_as_far_as_the_mask_covers_its_blocks() {
-    let shape = FrameShape::new(160, 192, 1).unwrap();
-    let even = Array3::from_elem((160, 192, 1), 1.0);
-    // All light is residual.
-    let batch = batch(shape, &[even.clone(), even], 2.0);
-    for (x, y, through) in [(0.5, -0.8, 20.0), (-0.6, -0.9, 150.0), (1.0, 0.02, -90.0), (0.0, 1.0, -60.0)] {
+    let lines = [(0.5, -0.8, 20.0), (-0.6, -0.9, 150.0), (1.0, 0.02, -90.0), (0.0, 1.0, -60.0)];
+    for ((x, y, through), side) in lines.into_iter().flat_map(|line| [4, 8, 32].map(|side| (line, side))) {
+        let shape = FrameShape::new(160, 192, 1).unwrap().with_block_px(side).unwrap();
+        let even = Array3::from_elem((160, 192, 1), 1.0);
+        // All light is residual.
+        let batch = batch(shape, &[even.clone(), even], 2.0);
         let line = |dot: f64| [x, y, through + 40.0 * dot];
         // m = (dot, 0) selects the line.
         let fundamental = Fundamental::from_rows([[0.0, 0.0, 40.0], [0.0; 3], line(0.0)]);
@@ -326,19 +328,20 @@ fn a_residual_is_direct_as_far_as_the_mask_covers_its_blocks() {
         let mask =
             EpipolarMask { distance_px: distance * scale, sigma_px: sigma * scale, rule: MaskRule::Plateau };
         let direct = epipolar(&batch, &floodlit(&batch), &fundamental, &mirror, &mask).unwrap().direct;
-        for (block, value) in direct.exact_chunks((32, 32, 1)).into_iter().enumerate() {
+        for (block, value) in direct.exact_chunks((side, side, 1)).into_iter().enumerate() {
             let share = |line: [f64; 3]| {
                 let weight = |pixel: usize| {
-                    let (row, column) = (block / 6 * 32 + pixel / 32, block % 6 * 32 + pixel % 32);
+                    let (down, right) = (block / shape.block_columns(), block % shape.block_columns());
+                    let (row, column) = (down * side + pixel / side, right * side + pixel % side);
                     let length = line[0].hypot(line[1]);
                     let away =
                         (line[0] * column as f64 + line[1] * row as f64 + line[2]).abs() / length - distance;
                     if away <= 0.0 { 1.0 } else { (-0.5 * (away / sigma).powi(2)).exp() }
                 };
-                (0..1024).map(weight).sum::<f64>() / 1024.0
+                (0..side * side).map(weight).sum::<f64>() / (side * side) as f64
             };
             let expected = share(line(0.0)) + share(line(1.0));
-            let value = f64::from(value[[5, 5, 0]]);
+            let value = f64::from(value[[side / 2, side / 3, 0]]);
             assert!((value - expected).abs() < 0.05, "block {block}: {value} {expected}");
         }
     }
@@ -532,8 +535,8 @@ fn products_are_the_same_for_any_number_of_threads() {
 
 #[test]
 fn the_light_of_a_column_is_that_of_its_image_in_a_cut_last_row_of_blocks_too() {
-    for channels in [1, 3] {
-        let shape = FrameShape::new(75, 64, channels).unwrap();
+    for (channels, side) in [(1, 4), (3, 4), (1, 16), (3, 32)] {
+        let shape = FrameShape::new(75, 64, channels).unwrap().with_block_px(side).unwrap();
         let images = random_images(shape, 4, 5);
         let energies = column_energies(&batch(shape, &images, 0.61));
         for (energy, image) in energies.iter().zip(&images) {

@@ -31,16 +31,16 @@ pub struct Sensor {
 }
 
 impl DarkRun {
-    /// A run of `frames` dark frames, which start a rolling mean worth `background_batches` frames. Frames in which
+    /// A run of `frames` dark frames, which start a rolling mean worth `background_frames` frames. Frames in which
     /// most pixels have `saturation_dn` or more are left out.
     ///
     /// # Errors
-    /// [`DotsError::OutOfRange`] for zero batches, [`DotsError::TooFew`] for fewer frames than the calibration needs.
+    /// [`DotsError::OutOfRange`] for a mean of none, [`DotsError::TooFew`] for fewer frames than the calibration needs.
     pub fn new(
         shape: FrameShape,
         saturation_dn: u16,
         frames: u32,
-        background_batches: u32,
+        background_frames: u32,
     ) -> Result<Self, DotsError> {
         let needed = 2 * NOISE_FRAMES;
         if (frames as usize) < needed {
@@ -53,7 +53,7 @@ impl DarkRun {
             wanted: frames,
             taken: 0,
             statistics: RunStatistics::new(shape),
-            mean: BackgroundMean::new(shape, background_batches)?,
+            mean: BackgroundMean::new(shape, background_frames)?,
             noisy: Vec::with_capacity(NOISE_FRAMES),
         })
     }
@@ -68,7 +68,7 @@ impl DarkRun {
             self.statistics.push(frame)?;
             match self.noisy.len() < NOISE_FRAMES {
                 true => self.noisy.push(frame.to_vec()),
-                false => self.mean.push(frame)?,
+                false => self.mean.push_dark(frame)?,
             }
         }
         Ok(self.taken < self.wanted)
@@ -174,7 +174,7 @@ mod tests {
         }
         let sensor = run.finish(8.0, None, Sampling::Full).unwrap();
         assert_eq!(sensor.correction.hot(), [70]);
-        assert_eq!(sensor.background.seen(), 32);
+        assert!((sensor.background.variance() * 32.0 - 1.0).abs() < 1e-9, "the mean of 32 frames");
         // Uniform over 0 to 7: sigma is the square root of 63/12.
         assert!((sensor.floor.sigma - 2.29).abs() < 0.2, "{:?}", sensor.floor);
         assert!(sensor.floor.mean.abs() < 0.3, "{:?}", sensor.floor);

@@ -220,7 +220,9 @@ mod tests {
             column
         };
         let fused = column("denoise", true);
-        assert!(!fused.words.is_empty() && fused.residual.iter().all(|&light| light == 2.0));
+        // Blocks that the discs cover wholly have none.
+        let (even, covered): (Vec<f32>, Vec<f32>) = fused.residual.iter().partition(|&&light| light == 2.0);
+        assert!(!fused.words.is_empty() && even.len() > 240 && covered.iter().all(|&light| light == 0.0));
         assert_eq!(fused, column("denoise-reference", true));
         assert!(column("denoise", false).residual.iter().all(|&light| light == 0.0));
     }

@@ -1,9 +1,7 @@
-use ndarray::Array3;
-
 use super::column::bits;
 use super::error::{check_range, check_shape};
 use super::sensor::median;
-use super::shape::BLOCK_PX;
+use super::shape::WORD_PX;
 use super::{Correction, DotsError, FrameShape, Region};
 
 /// Upper limit of the counts that the vector kernels support: the 12 bits of fast cameras.
@@ -15,56 +13,63 @@ pub(crate) const HOT_BACKGROUND: u16 = 2 * NARROW_LIMIT - 1;
 
 /// A running mean of the frames whose light went into the beam dump: ambient light and dark level.
 ///
-/// A batch has one such frame. Subtracting it alone would put its noise into every column of the batch, so that sums
-/// over all N dots contain it N times. The mean lowers that noise. It starts as a plain mean and becomes exponential
-/// after (n + 1)/2 frames, with the weight 2/(n + 1), which gives the noise of a mean of the last n batches.
+/// Subtracting one such frame would put its noise into every column of a batch, so that sums over all N dots contain it
+/// N times. The mean lowers that noise. It is a Kalman filter of a level that drifts as a random walk: after many frames
+/// it is exponential with the weight 2/(n + 1), which gives the noise of a mean of the last n frames. Dark frames that
+/// were taken at once, before anything could drift, lower it further until their weight is lost.
 #[derive(Debug, Clone)]
 pub struct BackgroundMean {
-    shape: FrameShape,
-    batches: u32,
-    seen: u32,
+    /// Variance by which the level drifts from frame to frame; 1 is that of a frame's noise.
+    drift: f64,
+    /// Variance of the mean, in the same unit.
+    variance: f64,
     mean: Vec<f32>,
 }
 
 impl BackgroundMean {
-    /// A mean with the noise of `batches` averaged batches.
+    /// A mean with the noise of `frames` averaged frames.
     ///
     /// # Errors
     /// [`DotsError::OutOfRange`] for 0.
-    pub fn new(shape: FrameShape, batches: u32) -> Result<Self, DotsError> {
-        check_range("background.batches", batches.into(), batches > 0, "at least 1; 64 is usual")?;
-        Ok(Self { shape, batches, seen: 0, mean: vec![0.0; shape.values()] })
+    pub fn new(shape: FrameShape, frames: u32) -> Result<Self, DotsError> {
+        check_range("background.frames", frames.into(), frames > 0, "at least 1; 64 is usual")?;
+        let weight = 2.0 / (f64::from(frames) + 1.0);
+        // The drift with which the weight stays as it is.
+        let drift = weight * weight / (1.0 - weight);
+        Ok(Self { drift, variance: f64::INFINITY, mean: vec![0.0; shape.values()] })
     }
 
-    /// Starts with the dark frame, `[height, width, channels]`, which is used until the first batch has ended and
-    /// then discarded.
+    /// Adds one of the dark frames that are taken at once.
     ///
     /// # Errors
-    /// [`DotsError::Shape`] if it does not have the frame's shape.
-    pub fn starting_with(mut self, dark: &Array3<f32>) -> Result<Self, DotsError> {
-        let expected = [self.shape.height(), self.shape.width(), self.shape.channels()];
-        check_shape("dark", "[height, width, channels]", dark.shape(), &expected)?;
-        self.mean.iter_mut().zip(dark).for_each(|(mean, &dark)| *mean = dark);
-        Ok(self)
+    /// [`DotsError::Shape`] if it does not have the frame's size.
+    pub fn push_dark(&mut self, frame: &[u16]) -> Result<(), DotsError> {
+        self.mix(frame, self.variance)
     }
 
-    /// Adds the background frame of a batch.
+    /// Adds a frame of the beam dump.
     ///
     /// # Errors
     /// [`DotsError::Shape`] if it does not have the frame's size.
     pub fn push(&mut self, frame: &[u16]) -> Result<(), DotsError> {
+        self.mix(frame, self.variance + self.drift)
+    }
+
+    /// Adds a frame to a mean of this variance.
+    fn mix(&mut self, frame: &[u16], variance: f64) -> Result<(), DotsError> {
         check_shape("frame", "[values]", &[frame.len()], &[self.mean.len()])?;
-        self.seen = self.seen.saturating_add(1);
-        let weight = (1.0 / self.seen as f32).max(2.0 / (self.batches as f32 + 1.0));
+        let weight = 1.0 / (1.0 + 1.0 / variance);
+        // The mean's variance is then that part of the frame's.
+        self.variance = weight;
         for (mean, &raw) in self.mean.iter_mut().zip(frame) {
-            *mean += weight * (f32::from(raw) - *mean);
+            *mean += weight as f32 * (f32::from(raw) - *mean);
         }
         Ok(())
     }
 
-    /// Number of frames added so far.
-    pub fn seen(&self) -> u32 {
-        self.seen
+    /// Variance of the mean; 1 is that of a frame's noise.
+    pub fn variance(&self) -> f64 {
+        self.variance
     }
 
     /// The mean in counts, `[height, width, channels]`.
@@ -126,13 +131,12 @@ impl Background {
         self.block_sound.fill(0);
         self.narrow = true;
         for (word, &hot) in correction.hot_masks().iter().enumerate() {
-            let block = shape.block_of_word(word);
-            self.block_sound[block] += (!hot).count_ones();
             for bit in bits(hot) {
-                self.counts[word * BLOCK_PX + bit] = HOT_BACKGROUND;
+                self.counts[word * WORD_PX + bit] = HOT_BACKGROUND;
             }
             for bit in bits(!hot) {
-                let pixel = word * BLOCK_PX + bit;
+                let (pixel, block) = (word * WORD_PX + bit, shape.block_of(word, bit));
+                self.block_sound[block] += 1;
                 let of_pixel = &mean[pixel * channels..][..channels];
                 let counts = mean_luminance(of_pixel).round() as u16;
                 self.counts[pixel] = counts;
@@ -215,7 +219,7 @@ impl NoiseFloor {
         check_shape("frame", "[values]", &[frame.len()], &[shape.values()])?;
         let (mut count, mut sum, mut squares) = (0_usize, 0_i64, 0_i64);
         for pixel in region.pixels(shape) {
-            if correction.hot_masks()[pixel / BLOCK_PX] >> (pixel % BLOCK_PX) & 1 == 0 {
+            if correction.hot_masks()[pixel / WORD_PX] >> (pixel % WORD_PX) & 1 == 0 {
                 let raw = match shape.channels() {
                     1 => frame[pixel],
                     _ => luminance([frame[3 * pixel], frame[3 * pixel + 1], frame[3 * pixel + 2]]),
@@ -255,11 +259,11 @@ mod tests {
     }
 
     #[test]
-    fn the_mean_over_batches_loses_noise_as_one_of_that_many_frames() {
+    fn the_mean_loses_noise_as_one_of_that_many_frames() {
         let shape = FrameShape::new(64, 64, 1).unwrap();
-        let error = |batches: u32| {
-            let mut mean = BackgroundMean::new(shape, batches).unwrap();
-            for frame in noisy_frames(shape, 3 * u64::from(batches)) {
+        let error = |count: u32| {
+            let mut mean = BackgroundMean::new(shape, count).unwrap();
+            for frame in noisy_frames(shape, 3 * u64::from(count)) {
                 mean.push(&frame).unwrap();
             }
             let squares: f64 = mean.mean().iter().map(|mean| (f64::from(*mean) - 100.3).powi(2)).sum();
@@ -270,13 +274,22 @@ mod tests {
     }
 
     #[test]
-    fn the_dark_frame_serves_until_the_first_batch() {
-        let shape = FrameShape::new(2, 32, 1).unwrap();
-        let dark = Array3::from_elem((2, 32, 1), 64.0);
-        let mut mean = BackgroundMean::new(shape, 4).unwrap().starting_with(&dark).unwrap();
-        assert_eq!(mean.mean(), [64.0; 64]);
-        mean.push(&[70; 64]).unwrap();
-        assert_eq!(mean.mean(), [70.0; 64]);
+    fn dark_frames_lower_the_noise_until_the_level_may_have_drifted() {
+        let shape = FrameShape::new(64, 64, 1).unwrap();
+        let frames = noisy_frames(shape, 464);
+        let mut mean = BackgroundMean::new(shape, 16).unwrap();
+        let mut error = |of: std::ops::Range<usize>, is_dark: bool| {
+            for frame in &frames[of] {
+                if is_dark { mean.push_dark(frame) } else { mean.push(frame) }.unwrap();
+            }
+            let squares: f64 = mean.mean().iter().map(|mean| (f64::from(*mean) - 100.3).powi(2)).sum();
+            3.0 / (squares / 4096.0).sqrt()
+        };
+        // In roots of the number of frames that have the same noise.
+        let [dark, soon, late] = [error(0..400, true), error(400..401, false), error(401..464, false)];
+        assert!((dark / 20.0 - 1.0).abs() < 0.1, "{dark}");
+        assert!(soon > 8.0, "one frame replaces a hundred: {soon}");
+        assert!((late / 4.0 - 1.0).abs() < 0.1, "{late}");
     }
 
     #[test]

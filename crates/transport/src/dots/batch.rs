@@ -1,6 +1,6 @@
 use super::column::bits;
 use super::error::check_shape;
-use super::shape::BLOCK_PX;
+use super::shape::WORD_PX;
 use super::{ColumnOutcome, DotsError, FrameShape, SparseColumn};
 
 /// The columns of one batch in the layout in which they are stored: each field is one array of a file.
@@ -69,7 +69,7 @@ pub struct Batch {
     arrays: BatchArrays,
     /// Number of pixels before each word, `[words + 1]`.
     starts: Vec<u32>,
-    /// Start of the words of each dot in each row of blocks, `[block rows + 1, dots]`.
+    /// Start of the words of each dot in each band, `[bands + 1, dots]`.
     bands: Vec<u32>,
 }
 
@@ -132,7 +132,7 @@ impl Batch {
             }
         }
 
-        let mut bands = vec![0; (shape.block_rows() + 1) * dots];
+        let mut bands = vec![0; (shape.bands() + 1) * dots];
         for dot in 0..dots {
             let (first, end) = (arrays.word_offsets[dot] as usize, arrays.word_offsets[dot + 1] as usize);
             let of_dot = &arrays.words[first..end];
@@ -143,7 +143,7 @@ impl Batch {
                 return damaged("a word lies beyond the frame", end - 1);
             }
             let mut at = 0;
-            for band in 0..=shape.block_rows() {
+            for band in 0..=shape.bands() {
                 at += of_dot[at..].iter().take_while(|&&word| (word as usize) < band * shape.width()).count();
                 bands[band * dots + dot] = (first + at) as u32;
             }
@@ -193,7 +193,7 @@ impl Batch {
         Column { batch: self, words, residual: &self.arrays.residual[dot * residual..][..residual] }
     }
 
-    /// The dots with pixels in a row of blocks, in ascending order, each with its words in this row.
+    /// The dots with pixels in a band, in ascending order, each with its words in this band.
     pub(crate) fn in_band(&self, band: usize) -> impl Iterator<Item = (usize, Column<'_>)> {
         let offsets = &self.bands[band * self.dots()..(band + 2) * self.dots()];
         let (first, end) = offsets.split_at(self.dots());
@@ -212,7 +212,7 @@ impl Batch {
     }
 }
 
-/// A dot's column in a batch, or its words in one row of blocks.
+/// A dot's column in a batch, or its words in one band.
 #[derive(Debug, Clone)]
 pub struct Column<'a> {
     batch: &'a Batch,
@@ -243,11 +243,23 @@ impl<'a> Column<'a> {
         })
     }
 
+    /// The words in parts that lie in one block each; each comes with its block.
+    pub(crate) fn parts(&self) -> impl Iterator<Item = (usize, Word<'a>)> + use<'a> {
+        let shape = self.batch.shape;
+        self.words().flat_map(move |Word { word, mask, mut values }| {
+            shape.blocks_of_word(word, mask).map(move |(block, mask)| {
+                let (of_part, rest) = values.split_at(mask.count_ones() as usize * shape.channels());
+                values = rest;
+                (block, Word { word, mask, values: of_part })
+            })
+        })
+    }
+
     /// The pixels of the mask with their values, each `[channels]`.
     pub fn pixels(&self) -> impl Iterator<Item = (usize, &'a [f32])> + use<'a> {
         let channels = self.batch.shape.channels();
         self.words().flat_map(move |word| {
-            bits(word.mask).map(move |bit| word.word * BLOCK_PX + bit).zip(word.values.chunks_exact(channels))
+            bits(word.mask).map(move |bit| word.word * WORD_PX + bit).zip(word.values.chunks_exact(channels))
         })
     }
 
@@ -282,9 +294,11 @@ impl<'a> Column<'a> {
         let range = self.words.clone();
         let words = self.batch.arrays.words[range.clone()].iter().zip(&self.batch.arrays.masks[range]);
         for (&word, mask) in words {
-            let means = &self.residual[shape.block_of_word(word as usize) * channels..][..channels];
-            let pixels = f64::from(mask.count_ones());
-            energy.iter_mut().zip(means).for_each(|(energy, &mean)| *energy -= pixels * f64::from(mean));
+            for (block, mask) in shape.blocks_of_word(word as usize, *mask) {
+                let means = &self.residual[block * channels..][..channels];
+                let pixels = f64::from(mask.count_ones());
+                energy.iter_mut().zip(means).for_each(|(energy, &mean)| *energy -= pixels * f64::from(mean));
+            }
         }
         energy
     }

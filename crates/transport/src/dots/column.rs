@@ -1,6 +1,6 @@
 use std::ops::Range;
 
-use super::shape::BLOCK_PX;
+use super::shape::WORD_PX;
 
 /// The outcome of Algorithm 1 for one frame.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -12,7 +12,7 @@ pub struct ColumnOutcome {
 }
 
 /// The light transport of one dot: individual pixels in discs around its brightest points, and for all other pixels
-/// the mean of each block of 32 x 32. In counts above the background, times the flat field's gain; may be negative.
+/// the mean of each block. In counts above the background, times the flat field's gain; may be negative.
 ///
 /// The arrays keep their memory when the column is overwritten.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -35,7 +35,7 @@ impl SparseColumn {
         self.words
             .iter()
             .zip(&self.masks)
-            .flat_map(|(&word, &mask)| bits(mask).map(move |bit| word as usize * BLOCK_PX + bit))
+            .flat_map(|(&word, &mask)| bits(mask).map(move |bit| word as usize * WORD_PX + bit))
     }
 
     pub(crate) fn clear(&mut self) {

@@ -2,7 +2,7 @@ use ndarray::ArrayView3;
 
 use super::column::bits;
 use super::error::{check_range, check_shape};
-use super::shape::BLOCK_PX;
+use super::shape::WORD_PX;
 use super::{DotsError, FrameShape};
 
 /// How the sensor samples colour, which determines which neighbours may replace a hot pixel.
@@ -86,7 +86,7 @@ impl Correction {
     fn build(shape: FrameShape, gain: Vec<f32>, hot: &[u32], sampling: Sampling) -> Self {
         let mut hot_masks = vec![0_u32; shape.words()];
         for &pixel in hot {
-            hot_masks[pixel as usize / BLOCK_PX] |= 1 << (pixel as usize % BLOCK_PX);
+            hot_masks[pixel as usize / WORD_PX] |= 1 << (pixel as usize % WORD_PX);
         }
         let (mut sources, mut source_offsets) = (Vec::new(), vec![0]);
         for &pixel in hot {
@@ -98,10 +98,10 @@ impl Correction {
         let mut sums = vec![0.0_f64; shape.blocks() * channels];
         let mut counts = vec![0_u32; shape.blocks()];
         for (word, &hot) in hot_masks.iter().enumerate() {
-            let block = shape.block_of_word(word);
-            counts[block] += (!hot).count_ones();
             for bit in bits(!hot) {
-                let of_pixel = &gain[(word * BLOCK_PX + bit) * channels..][..channels];
+                let block = shape.block_of(word, bit);
+                counts[block] += 1;
+                let of_pixel = &gain[(word * WORD_PX + bit) * channels..][..channels];
                 for (sum, &gain) in sums[block * channels..].iter_mut().zip(of_pixel) {
                     *sum += f64::from(gain).recip();
                 }
@@ -168,7 +168,7 @@ fn sound_neighbours(shape: FrameShape, hot_masks: &[u32], pixel: usize, sampling
         let row = row.checked_add_signed(down * step).filter(|&row| row < shape.height())?;
         let column = column.checked_add_signed(right * step).filter(|&column| column < shape.width())?;
         let pixel = row * shape.width() + column;
-        (hot_masks[pixel / BLOCK_PX] >> (pixel % BLOCK_PX) & 1 == 0).then_some(pixel as u32)
+        (hot_masks[pixel / WORD_PX] >> (pixel % WORD_PX) & 1 == 0).then_some(pixel as u32)
     };
     (1..=MAX_REPAIR_RINGS)
         .map(|ring| {

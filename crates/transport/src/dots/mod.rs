@@ -25,7 +25,7 @@ pub use denoise::{DenoiseSettings, Denoiser, Scratch, StopRule, false_alarm_sigm
 pub use error::DotsError;
 pub use flat::FlatField;
 pub use sensor::RunStatistics;
-pub use shape::{BLOCK_PX, FrameShape, Region};
+pub use shape::{FrameShape, Region, WORD_PX};
 pub use synchronise::{
     Cause, Decided, Fate, Observation, SyncCounts, SyncSettings, Synchroniser, pulse_threshold,
 };

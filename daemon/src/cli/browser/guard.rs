@@ -95,7 +95,9 @@ mod tests {
         }
         let two = ["127.0.0.1:8000", "example.org"].map(|host| (header::HOST, host.parse().unwrap()));
         let mut headers = HeaderMap::new();
-        two.into_iter().for_each(|(name, host)| drop(headers.append(name, host)));
+        for (name, host) in two {
+            headers.append(name, host);
+        }
         assert!(guard.refusal("/0123abcd/", &headers).is_some(), "two hosts");
     }
 }

@@ -153,7 +153,9 @@ impl DotPasses<'_> {
         let (task, plan) = (self.task, &self.task.batches);
         let CorrectOptions { hot_sigmas, background_batches, .. } = task.correct;
         let (shape, saturation_dn) = (task.shape, task.saturation_dn());
-        let mut dark = DarkRun::new(shape, saturation_dn, plan.dark_frames, background_batches)?;
+        let background_frames =
+            background_batches.saturating_mul(plan.background_indices.len().max(1) as u32);
+        let mut dark = DarkRun::new(shape, saturation_dn, plan.dark_frames, background_frames)?;
         if !self.without_light(plan.dark_frames, &mut |frame| dark.push(frame))? {
             return Ok(None);
         }

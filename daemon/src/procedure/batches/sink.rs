@@ -241,7 +241,7 @@ impl BatchWriter {
         let start_s = (start_ns - first_ns) as f64 * 1e-9;
         let empty = (0..seen.len()).filter(|&dot| seen[dot] && columns.discs[dot] == 0).count();
         let capped = columns.capped.iter().filter(|&&capped| capped).count();
-        let stored = to_stored(columns, seen);
+        let stored = to_stored(self.writing.task.shape, columns, seen);
         let entry = BatchEntry {
             batch,
             plane,

@@ -22,8 +22,8 @@ use crate::run::progress::ProgressMeter;
 
 /// Pixels this many standard deviations beyond the others are hot.
 const HOT_SIGMAS: f64 = 8.0;
-/// Number of batches of dark frames that the background averages over.
-const BACKGROUND_BATCHES: u32 = 64;
+/// Number of frames that the background is worth once it rolls.
+const BACKGROUND_FRAMES: u32 = 64;
 /// How often the progress within an axis is told.
 const TOLD_OF_AXIS: usize = 20;
 
@@ -112,7 +112,7 @@ impl Recorder {
     ) -> Result<Option<Sensor>, RunError> {
         let (task, orders) = (self.task.clone(), self.run.orders.clone());
         let wanted = task.response.dark_frames;
-        let mut dark = DarkRun::new(task.shape, task.saturation_dn(), wanted, BACKGROUND_BATCHES)?;
+        let mut dark = DarkRun::new(task.shape, task.saturation_dn(), wanted, BACKGROUND_FRAMES)?;
         let path = task.paths[0].clone().with_light(|_| 0);
         let rounds = wanted.div_ceil(task.frames() as u32) + 1;
         let has_enough = AtomicBool::new(false);

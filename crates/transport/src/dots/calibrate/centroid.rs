@@ -4,7 +4,7 @@ use crate::dots::batch::Word;
 use crate::dots::column::bits;
 use crate::dots::error::check_shape;
 use crate::dots::sensor::median;
-use crate::dots::shape::BLOCK_PX;
+use crate::dots::shape::WORD_PX;
 use crate::dots::{Batch, DotsError, FrameShape};
 
 /// A dot with less than this share of the median dot's light missed the plane, or most of it: what is seen is noise, or
@@ -53,7 +53,7 @@ impl Centroids {
                 let Some((_, footprint)) = covered.next_if(|(at, _)| *at == word) else { continue };
                 for (bit, value) in bits(mask).zip(values.chunks_exact(shape.channels())) {
                     if footprint >> bit & 1 == 1 {
-                        let (pixel, value) = (word * BLOCK_PX + bit, f64::from(luminance(value)));
+                        let (pixel, value) = (word * WORD_PX + bit, f64::from(luminance(value)));
                         light += value;
                         x += value * (pixel % shape.width()) as f64;
                         y += value * (pixel / shape.width()) as f64;

@@ -7,7 +7,7 @@ use super::Centroids;
 use super::footprint::luminance;
 use crate::dots::error::check_shape;
 use crate::dots::sensor::median;
-use crate::dots::shape::BLOCK_PX;
+use crate::dots::shape::WORD_PX;
 use crate::dots::{Batch, BatchArrays, DotsError, FrameShape, SparseColumn};
 
 /// Pixels below this share of the peak are not part of the dot.
@@ -132,13 +132,13 @@ impl Plane {
             };
             dot.sort_unstable();
             for pixel in dot {
-                let word = (pixel / BLOCK_PX) as u32;
+                let word = (pixel / WORD_PX) as u32;
                 if spread.words.last() != Some(&word) {
                     spread.words.push(word);
                     spread.masks.push(0);
                 }
                 if let Some(mask) = spread.masks.last_mut() {
-                    *mask |= 1 << (pixel % BLOCK_PX);
+                    *mask |= 1 << (pixel % WORD_PX);
                 }
                 spread.values.push(if unimodal { self.light[pixel] / peak } else { 1.0 });
             }

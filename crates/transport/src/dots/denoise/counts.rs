@@ -4,7 +4,7 @@
 use super::lanes::Lanes;
 use crate::dots::background::NARROW_LIMIT;
 use crate::dots::column::bits;
-use crate::dots::shape::BLOCK_PX;
+use crate::dots::shape::WORD_PX;
 use crate::dots::{Background, Correction, FrameShape};
 
 /// Words per segment: 1024 consecutive pixels, whatever the frame's width. Segments that follow memory are read
@@ -23,7 +23,7 @@ pub(super) struct Survey {
     pub block_sums: Vec<i32>,
     /// Sum of squared differences.
     pub squares: u64,
-    /// Sums of column pairs within a row of blocks.
+    /// Sums of column pairs within a row of blocks, `[word columns]`.
     lanes: Vec<[i32; 16]>,
 }
 
@@ -33,7 +33,7 @@ impl Survey {
             maxima: vec![NOTHING; shape.words().div_ceil(SEGMENT_WORDS)],
             block_sums: vec![0; shape.blocks()],
             squares: 0,
-            lanes: vec![[0; 16]; shape.block_columns()],
+            lanes: vec![[0; 16]; shape.word_columns()],
         }
     }
 }
@@ -57,8 +57,8 @@ fn words_of(segment: usize, words: usize) -> std::ops::Range<usize> {
 /// Differences in 16 bits, for counts below 2^12.
 pub(super) struct NarrowCounts<'a, L> {
     lanes: L,
-    raw: &'a [[u16; BLOCK_PX]],
-    background: &'a [[u16; BLOCK_PX]],
+    raw: &'a [[u16; WORD_PX]],
+    background: &'a [[u16; WORD_PX]],
     correction: &'a Correction,
 }
 
@@ -86,9 +86,9 @@ impl<'a, L: Lanes> NarrowCounts<'a, L> {
     fn leave_out_hot(&self, survey: &mut Survey) {
         let shape = self.correction.shape();
         for &pixel in self.correction.hot() {
-            let (word, bit) = (pixel as usize / BLOCK_PX, pixel as usize % BLOCK_PX);
+            let (word, bit) = (pixel as usize / WORD_PX, pixel as usize % WORD_PX);
             let difference = i32::from(self.raw[word][bit]) - i32::from(self.background[word][bit]);
-            survey.block_sums[shape.block_of_word(word)] -= difference;
+            survey.block_sums[shape.block_of(word, bit)] -= difference;
             survey.squares -= u64::from((difference * difference) as u32);
         }
     }
@@ -98,14 +98,15 @@ impl<L: Lanes> CountDifferences for NarrowCounts<'_, L> {
     #[inline(always)]
     fn survey(&self, survey: &mut Survey) -> bool {
         let (lanes, columns) = (self.lanes, survey.lanes.len());
-        let words_of_band = columns * BLOCK_PX;
+        let shape = self.correction.shape();
+        let words_of_row = columns * shape.block_px();
         let mut seen = lanes.all(0);
         let mut largest = lanes.all(i16::MIN);
         let mut squares = lanes.load_sums(&[0; 16]);
         survey.squares = 0;
         let mut word = 0;
-        let bands = self.raw.chunks(words_of_band).zip(self.background.chunks(words_of_band));
-        for ((raw, background), sums) in bands.zip(survey.block_sums.chunks_mut(columns)) {
+        let rows = self.raw.chunks(words_of_row).zip(self.background.chunks(words_of_row));
+        for ((raw, background), sums) in rows.zip(survey.block_sums.chunks_mut(shape.block_columns())) {
             survey.lanes.fill([0; 16]);
             let (mut raw, mut background) = (raw, background);
             while !raw.is_empty() {
@@ -133,8 +134,9 @@ impl<L: Lanes> CountDifferences for NarrowCounts<'_, L> {
                     squares = lanes.load_sums(&[0; 16]);
                 }
             }
-            for (sum, lanes) in sums.iter_mut().zip(&survey.lanes) {
-                *sum = lanes.iter().sum();
+            let pairs = survey.lanes.as_flattened().chunks_exact(shape.block_px() / 2);
+            for (sum, pairs) in sums.iter_mut().zip(pairs) {
+                *sum = pairs.iter().sum();
             }
         }
         let seen = lanes.to_array(seen).into_iter().fold(0, |seen, lane| seen | lane as u16);
@@ -158,7 +160,7 @@ impl<L: Lanes> CountDifferences for NarrowCounts<'_, L> {
     fn find(&self, segment: usize, difference: i32, taken: &[u32]) -> Option<usize> {
         words_of(segment, self.raw.len()).find_map(|word| {
             let equal = self.lanes.equal(self.difference(word), difference as i16) & !taken[word];
-            (equal != 0).then(|| word * BLOCK_PX + equal.trailing_zeros() as usize)
+            (equal != 0).then(|| word * WORD_PX + equal.trailing_zeros() as usize)
         })
     }
 }
@@ -173,7 +175,7 @@ pub(super) struct Wide<'a> {
 impl Wide<'_> {
     fn sound(&self, word: usize, taken: u32) -> impl Iterator<Item = (usize, i32)> {
         bits(!(self.correction.hot_masks()[word] | taken)).map(move |bit| {
-            let pixel = word * BLOCK_PX + bit;
+            let pixel = word * WORD_PX + bit;
             (pixel, i32::from(self.raw[pixel]) - i32::from(self.background.counts[pixel]))
         })
     }
@@ -186,11 +188,10 @@ impl CountDifferences for Wide<'_> {
         survey.maxima.fill(NOTHING);
         survey.squares = 0;
         for word in 0..shape.words() {
-            let (largest, sum) =
-                (&mut survey.maxima[word / SEGMENT_WORDS], &mut survey.block_sums[shape.block_of_word(word)]);
-            for (_, difference) in self.sound(word, 0) {
+            let largest = &mut survey.maxima[word / SEGMENT_WORDS];
+            for (pixel, difference) in self.sound(word, 0) {
                 *largest = difference.max(*largest);
-                *sum += difference;
+                survey.block_sums[shape.block_of(word, pixel % WORD_PX)] += difference;
                 survey.squares += i64::from(difference).pow(2) as u64;
             }
         }

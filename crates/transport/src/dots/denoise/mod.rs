@@ -17,7 +17,7 @@ use self::lanes::{Lanes, Portable};
 use super::background::luminance;
 use super::column::{bits, runs};
 use super::error::check_shape;
-use super::shape::BLOCK_PX;
+use super::shape::WORD_PX;
 use super::{Background, Batch, BatchArrays, ColumnOutcome, Correction, DotsError, NoiseFloor, SparseColumn};
 use crate::plane::SimdLevel;
 
@@ -27,7 +27,7 @@ const FRAMES_AT_A_TIME: usize = 32;
 /// Turns raw frames into sparse columns.
 ///
 /// The brightest pixel above the background is found and the disc around it is taken out, until the [`StopRule`] is
-/// met. The pixels taken form the column; the rest is kept as the mean of each block of 32 x 32 pixels. Pixels that
+/// met. The pixels taken form the column; the rest is kept as the mean of each block of pixels ([`FrameShape::block_px`](super::FrameShape::block_px)). Pixels that
 /// were taken no longer count for maximum and statistics. Ties go to the first pixel in reading order. Values are raw
 /// minus background times the flat field's gain. Hot pixels, which are never the maximum, get the mean of their
 /// neighbours. Nothing is clamped at 0: the bias would add up over all dots.
@@ -266,7 +266,7 @@ impl FrameTask<'_> {
             }
             let mut next = 0;
             for row in denoiser.disc.rows_around(shape, centre) {
-                let pixels = counts::SEGMENT_WORDS * BLOCK_PX;
+                let pixels = counts::SEGMENT_WORDS * WORD_PX;
                 for segment in next.max(row.start / pixels)..=(row.end - 1) / pixels {
                     // Maxima only decrease: a segment that was too low stays too low.
                     if scratch.survey.maxima[segment] >= least {
@@ -293,33 +293,35 @@ impl FrameTask<'_> {
         taken_sums.fill(0.0);
         taken_pixels.fill(0);
         touched.sort_unstable();
-        column.values.reserve(touched.len() * BLOCK_PX * channels);
+        column.values.reserve(touched.len() * WORD_PX * channels);
         for &word in &*touched {
             let at = word as usize;
-            let (mask, hot, block) = (taken[at], correction.hot_masks()[at], shape.block_of_word(at));
+            let (mask, hot) = (taken[at], correction.hot_masks()[at]);
             column.words.push(word);
             column.masks.push(mask);
             taken[at] = 0;
-            taken_pixels[block] += (mask & !hot).count_ones();
-            let sums = &mut taken_sums[block * channels..][..channels];
-            if mask & hot == 0 {
-                for run in runs(mask) {
-                    let run = (at * BLOCK_PX + run.start) * channels..(at * BLOCK_PX + run.end) * channels;
-                    let (raw, mean) = (&frame[run.clone()], &background.mean[run.clone()]);
-                    let above = raw.iter().zip(mean).map(|(&raw, mean)| f32::from(raw) - mean);
-                    column
-                        .values
-                        .extend(above.zip(&correction.gain()[run]).map(|(above, gain)| above * gain));
-                    add_run(sums, raw, mean);
-                }
-            } else {
-                for bit in bits(mask) {
-                    let pixel = at * BLOCK_PX + bit;
-                    for (channel, sum) in sums.iter_mut().enumerate() {
-                        column.values.push(correction.value(frame, &background.mean, pixel, channel));
-                        if hot >> bit & 1 == 0 {
-                            let value = pixel * channels + channel;
-                            *sum += f64::from(frame[value]) - f64::from(background.mean[value]);
+            for (block, mask) in shape.blocks_of_word(at, mask) {
+                taken_pixels[block] += (mask & !hot).count_ones();
+                let sums = &mut taken_sums[block * channels..][..channels];
+                if mask & hot == 0 {
+                    for run in runs(mask) {
+                        let run = (at * WORD_PX + run.start) * channels..(at * WORD_PX + run.end) * channels;
+                        let (raw, mean) = (&frame[run.clone()], &background.mean[run.clone()]);
+                        let above = raw.iter().zip(mean).map(|(&raw, mean)| f32::from(raw) - mean);
+                        column
+                            .values
+                            .extend(above.zip(&correction.gain()[run]).map(|(above, gain)| above * gain));
+                        add_run(sums, raw, mean);
+                    }
+                } else {
+                    for bit in bits(mask) {
+                        let pixel = at * WORD_PX + bit;
+                        for (channel, sum) in sums.iter_mut().enumerate() {
+                            column.values.push(correction.value(frame, &background.mean, pixel, channel));
+                            if hot >> bit & 1 == 0 {
+                                let value = pixel * channels + channel;
+                                *sum += f64::from(frame[value]) - f64::from(background.mean[value]);
+                            }
                         }
                     }
                 }
@@ -351,11 +353,11 @@ fn take(
     touched: &mut Vec<u32>,
     mut fresh: impl FnMut(usize, u32),
 ) {
-    let words = row.start / BLOCK_PX..=(row.end - 1) / BLOCK_PX;
+    let words = row.start / WORD_PX..=(row.end - 1) / WORD_PX;
     for (word, taken) in words.clone().zip(&mut taken[words]) {
-        let first = row.start.saturating_sub(word * BLOCK_PX);
-        let count = (row.end - word * BLOCK_PX).min(BLOCK_PX) - first;
-        let mask = (u32::MAX >> (BLOCK_PX - count)) << first;
+        let first = row.start.saturating_sub(word * WORD_PX);
+        let count = (row.end - word * WORD_PX).min(WORD_PX) - first;
+        let mask = (u32::MAX >> (WORD_PX - count)) << first;
         if *taken == 0 {
             touched.push(word as u32);
         }
@@ -398,12 +400,16 @@ fn sum_colours(frame: &[u16], correction: &Correction, sums: &mut [i32]) {
     let (sums, _) = sums.as_chunks_mut::<3>();
     sums.fill([0; 3]);
     for (word, &hot) in correction.hot_masks().iter().enumerate() {
-        let sum = &mut sums[correction.shape().block_of_word(word)];
-        let of_word = &pixels[word * BLOCK_PX..(word + 1) * BLOCK_PX];
-        for pixel in of_word {
-            (0..3).for_each(|colour| sum[colour] += i32::from(pixel[colour]));
+        let shape = correction.shape();
+        let of_word = &pixels[word * WORD_PX..(word + 1) * WORD_PX];
+        let blocks = of_word.chunks_exact(shape.block_px()).zip(&mut sums[shape.block_of(word, 0)..]);
+        for (of_block, sum) in blocks {
+            for pixel in of_block {
+                (0..3).for_each(|colour| sum[colour] += i32::from(pixel[colour]));
+            }
         }
         for bit in bits(hot) {
+            let sum = &mut sums[shape.block_of(word, bit)];
             (0..3).for_each(|colour| sum[colour] -= i32::from(of_word[bit][colour]));
         }
     }
@@ -414,7 +420,7 @@ impl Left {
     #[inline(always)]
     fn lose(&mut self, word: usize, pixels: u32, difference: impl Fn(usize) -> i64) {
         for bit in bits(pixels) {
-            let difference = difference(word * BLOCK_PX + bit);
+            let difference = difference(word * WORD_PX + bit);
             self.count -= 1;
             self.sum -= difference;
             self.squares -= difference * difference;

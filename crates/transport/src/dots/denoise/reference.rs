@@ -4,7 +4,7 @@ use super::rule::false_alarm_sigmas;
 use super::{DenoiseSettings, StopRule};
 use crate::dots::background::luminance;
 use crate::dots::error::check_shape;
-use crate::dots::shape::BLOCK_PX;
+use crate::dots::shape::WORD_PX;
 use crate::dots::{Background, ColumnOutcome, Correction, DotsError, NoiseFloor, SparseColumn};
 
 /// Denoises one raw frame, `[height, width, channels]`: for every disc the whole frame is searched again.
@@ -74,7 +74,7 @@ pub fn column(
     }
 
     let mut column = SparseColumn { outcome, ..SparseColumn::default() };
-    for (word, pixels) in taken.chunks(BLOCK_PX).enumerate() {
+    for (word, pixels) in taken.chunks(WORD_PX).enumerate() {
         let mask = pixels.iter().enumerate().fold(0, |mask, (bit, &taken)| mask | u32::from(taken) << bit);
         if mask != 0 {
             column.words.push(word as u32);
@@ -85,10 +85,10 @@ pub fn column(
     let value = |value: usize| correction.value(frame, &background.mean, value / channels, value % channels);
     column.values = of_taken.map(value).collect();
     for block in 0..shape.blocks() {
-        let (top, first) =
-            (block / shape.block_columns() * BLOCK_PX, block % shape.block_columns() * BLOCK_PX);
-        let rows = top..shape.height().min(top + BLOCK_PX);
-        let pixels = rows.flat_map(|row| (first..first + BLOCK_PX).map(move |column| row * width + column));
+        let side = shape.block_px();
+        let (top, first) = (block / shape.block_columns() * side, block % shape.block_columns() * side);
+        let rows = top..shape.height().min(top + side);
+        let pixels = rows.flat_map(|row| (first..first + side).map(move |column| row * width + column));
         let outside: Vec<usize> = pixels.filter(|&pixel| !is_hot(pixel) && !taken[pixel]).collect();
         for channel in 0..channels {
             let above = |pixel: &usize| {

@@ -8,7 +8,7 @@ use crate::dots::batch::Word;
 use crate::dots::calibrate::Fundamental;
 use crate::dots::column::runs;
 use crate::dots::error::{check_range, check_shape};
-use crate::dots::shape::BLOCK_PX;
+use crate::dots::shape::WORD_PX;
 use crate::dots::{Batch, DotsError, FrameShape};
 
 /// Frame width in pixels to which the distances of masks refer.
@@ -16,6 +16,9 @@ pub const REFERENCE_WIDTH_PX: f64 = 1024.0;
 
 /// A block's share of the mask is the mean over this many points per side.
 const POINTS: usize = 4;
+
+/// Shares of blocks that are kept for the next row of a disc.
+const BLOCKS_AT_HAND: usize = 16;
 
 /// Beyond this many sigmas the mask is 0; a Gaussian is 4e-6 there.
 const REACH_SIGMAS: f64 = 5.0;
@@ -120,12 +123,14 @@ impl Line {
     }
 
     /// The blocks of a row that the mask may reach; the share of all other blocks is 0.
-    fn blocks_near(&self, falloff: &Falloff, band: usize, shape: FrameShape) -> Range<usize> {
-        let reach = falloff.reach_px() + (HALF_PX + 0.5) * std::f64::consts::SQRT_2;
+    fn blocks_near(&self, falloff: &Falloff, row: usize, shape: FrameShape) -> Range<usize> {
+        let side = shape.block_px() as f64;
+        let half = (side - 1.0) / 2.0;
+        let reach = falloff.reach_px() + (half + 0.5) * std::f64::consts::SQRT_2;
         let columns = shape.block_columns();
         // Distance of the block's centre, a linear function of its column.
-        let at_0 = self.signed(HALF_PX, (band * BLOCK_PX) as f64 + HALF_PX);
-        let step = self.x * BLOCK_PX as f64;
+        let at_0 = self.signed(half, row as f64 * side + half);
+        let step = self.x * side;
         let (one, other) = ((-reach - at_0) / step, (reach - at_0) / step);
         let (first, last) = match step == 0.0 {
             true if at_0.abs() <= reach => (0.0, columns as f64 - 1.0),
@@ -134,7 +139,7 @@ impl Line {
         };
         let within = |column: f64| column.clamp(0.0, columns as f64) as usize;
         let (first, end) = (within(first), within(last + 1.0));
-        band * columns + first..band * columns + end.max(first)
+        row * columns + first..row * columns + end.max(first)
     }
 
     fn distance(&self, x: f64, y: f64) -> f64 {
@@ -177,8 +182,8 @@ pub fn epipolar(
     let residual = sum_blocks(batch, channels, |dot, sums| {
         let Some(line) = &lines[dot] else { return };
         let means = batch.column(dot).residual();
-        for band in 0..shape.block_rows() {
-            for block in line.blocks_near(&falloff, band, shape) {
+        for row in 0..shape.block_rows() {
+            for block in line.blocks_near(&falloff, row, shape) {
                 let share = share_of_block(line, &falloff, block, shape);
                 for channel in 0..channels {
                     sums[channel * blocks + block] += share * f64::from(means[block * channels + channel]);
@@ -188,21 +193,20 @@ pub fn epipolar(
     });
     let [direct] = by_bands(shape, channels, |band, sums| {
         let pixels = sums.len() / channels;
-        let mut weights = [0.0; BLOCK_PX];
+        let mut weights = [0.0; WORD_PX];
         for (dot, column) in batch.in_band(band) {
             let Some(line) = &lines[dot] else { continue };
             // Each row of a disc touches the same few blocks.
-            let mut shares = [(usize::MAX, 0.0); 2];
-            for Word { word, mask, mut values } in column.words() {
-                let block = shape.block_of_word(word);
-                let slot = &mut shares[block % 2];
+            let mut shares = [(usize::MAX, 0.0); BLOCKS_AT_HAND];
+            for (block, Word { word, mask, mut values }) in column.parts() {
+                let slot = &mut shares[block % BLOCKS_AT_HAND];
                 if slot.0 != block {
                     *slot = (block, share_of_block(line, &falloff, block, shape));
                 }
                 let share = slot.1;
-                let first = (word - first_word(batch, band)) * BLOCK_PX;
-                let left = (word % shape.block_columns() * BLOCK_PX) as f64;
-                let y = (word / shape.block_columns()) as f64;
+                let first = (word - first_word(batch, band)) * WORD_PX;
+                let left = (word % shape.word_columns() * WORD_PX) as f64;
+                let y = (word / shape.word_columns()) as f64;
                 for run in runs(mask) {
                     let (of_run, rest) = values.split_at(run.len() * channels);
                     values = rest;
@@ -222,22 +226,20 @@ pub fn epipolar(
             }
         }
         for (sums, residual) in sums.chunks_exact_mut(pixels).zip(residual.chunks_exact(blocks)) {
-            add_blocks(sums, &residual[blocks_of(batch, band)]);
+            add_blocks(sums, &residual[blocks_of(batch, band)], shape);
         }
     });
     let global = light - &direct;
     Ok(Separation { direct, global })
 }
 
-/// Distance from the first pixel of a block to its centre, along one axis.
-const HALF_PX: f64 = (BLOCK_PX as f64 - 1.0) / 2.0;
-
 /// Mean of the mask over a block.
 fn share_of_block(line: &Line, falloff: &Falloff, block: usize, shape: FrameShape) -> f64 {
-    const PITCH_PX: usize = BLOCK_PX / POINTS;
-    let left = (block % shape.block_columns() * BLOCK_PX) as f64;
-    let top = (block / shape.block_columns() * BLOCK_PX) as f64;
-    let at = |point: usize| (point * PITCH_PX) as f64 + (PITCH_PX as f64 - 1.0) / 2.0;
+    let (side, columns) = (shape.block_px(), shape.block_columns());
+    let pitch_px = (side / POINTS) as f64;
+    let left = (block % columns * side) as f64;
+    let top = (block / columns * side) as f64;
+    let at = |point: usize| point as f64 * pitch_px + (pitch_px - 1.0) / 2.0;
     let points = (0..POINTS * POINTS).map(|point| (left + at(point % POINTS), top + at(point / POINTS)));
     points.map(|(x, y)| falloff.at(line.distance(x, y))).sum::<f64>() / (POINTS * POINTS) as f64
 }

@@ -5,7 +5,7 @@ use crate::dots::batch::Word;
 use crate::dots::calibrate::Centroids;
 use crate::dots::column::runs;
 use crate::dots::error::{check_range, check_shape};
-use crate::dots::shape::BLOCK_PX;
+use crate::dots::shape::WORD_PX;
 use crate::dots::{Batch, DotsError};
 
 /// The scene with all dots lit: the sum of all columns, `[height, width, channels]`.
@@ -97,9 +97,8 @@ fn weighted(batch: &Batch, weights: ArrayView2<f32>) -> Array3<f32> {
     let [image] = by_bands(shape, colours, |band, sums| {
         let pixels = sums.len() / colours;
         for (dot, column) in batch.in_band(band) {
-            for Word { word, mask, mut values } in column.words() {
-                let block = shape.block_of_word(word);
-                let first = (word - first_word(batch, band)) * BLOCK_PX;
+            for (block, Word { word, mask, mut values }) in column.parts() {
+                let first = (word - first_word(batch, band)) * WORD_PX;
                 for run in runs(mask) {
                     let (of_run, rest) = values.split_at(run.len() * channels);
                     values = rest;
@@ -124,7 +123,7 @@ fn weighted(batch: &Batch, weights: ArrayView2<f32>) -> Array3<f32> {
             }
         }
         for (sums, residual) in sums.chunks_exact_mut(pixels).zip(residual.chunks_exact(blocks)) {
-            add_blocks(sums, &residual[blocks_of(batch, band)]);
+            add_blocks(sums, &residual[blocks_of(batch, band)], shape);
         }
     });
     image

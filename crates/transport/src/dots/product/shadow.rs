@@ -9,7 +9,7 @@ use crate::dots::calibrate::Confusion;
 use crate::dots::calibrate::luminance;
 use crate::dots::column::runs;
 use crate::dots::error::{check_range, check_shape};
-use crate::dots::shape::BLOCK_PX;
+use crate::dots::shape::WORD_PX;
 use crate::dots::{Batch, DotsError};
 
 /// Marks a pixel without a dot.
@@ -38,7 +38,7 @@ pub fn shadow_dot(batch: &Batch, light: &Array3<f32>) -> Result<Separation, Dots
         least.fill(f64::INFINITY);
         for (_, column) in batch.in_band(band) {
             for Word { word, mask, mut values } in column.words() {
-                let first = (word - first_word(batch, band)) * BLOCK_PX;
+                let first = (word - first_word(batch, band)) * WORD_PX;
                 for run in runs(mask) {
                     let (of_run, rest) = values.split_at(run.len() * channels);
                     values = rest;
@@ -74,7 +74,7 @@ pub fn shadow_dot(batch: &Batch, light: &Array3<f32>) -> Result<Separation, Dots
 
 /// The values of a row of blocks, `[pixels, channels]`.
 fn of_band<'a>(light: &'a [f32], band: usize, values: usize, batch: &Batch) -> &'a [f32] {
-    &light[band * BLOCK_PX * batch.shape().width() * batch.shape().channels()..][..values]
+    &light[band * WORD_PX * batch.shape().width() * batch.shape().channels()..][..values]
 }
 
 /// Separates direct from global light where dots overlap: at each pixel, all dots are switched off that share pixels
@@ -110,7 +110,7 @@ pub fn shadow_neighbours(
         let (mut brightest, mut dot_of) = (vec![f32::NEG_INFINITY; pixels], vec![NONE; pixels]);
         for (dot, column) in batch.in_band(band) {
             for Word { word, mask, mut values } in column.words() {
-                let first = (word - first_word(batch, band)) * BLOCK_PX;
+                let first = (word - first_word(batch, band)) * WORD_PX;
                 for run in runs(mask) {
                     let (of_run, rest) = values.split_at(run.len() * channels);
                     values = rest;
@@ -127,9 +127,8 @@ pub fn shadow_neighbours(
         }
         for (dot, column) in batch.in_band(band) {
             let neighbours = is_neighbour.of(dot);
-            for Word { word, mask, mut values } in column.words() {
-                let first = (word - first_word(batch, band)) * BLOCK_PX;
-                let block = shape.block_of_word(word);
+            for (block, Word { word, mask, mut values }) in column.parts() {
+                let first = (word - first_word(batch, band)) * WORD_PX;
                 for run in runs(mask) {
                     let (of_run, rest) = values.split_at(run.len() * channels);
                     values = rest;
@@ -151,9 +150,12 @@ pub fn shadow_neighbours(
         let light = of_band(light, band, pixels * channels, batch);
         let mut residuals: Vec<Option<[f64; 3]>> = vec![None; dots];
         let mut met = Vec::new();
-        for (column, block) in blocks_of(batch, band).enumerate() {
-            let rows = (column * BLOCK_PX..pixels).step_by(shape.width());
-            for pixel in rows.flat_map(|first| first..first + BLOCK_PX) {
+        let (side, columns) = (shape.block_px(), shape.block_columns());
+        for (at, block) in blocks_of(batch, band).enumerate() {
+            let rows = (at / columns * side..pixels / shape.width()).take(side);
+            let first = at % columns * side;
+            for pixel in rows.flat_map(|row| row * shape.width() + first..row * shape.width() + first + side)
+            {
                 let dot = dot_of[pixel] as usize;
                 let (residual, count) = match dot_of[pixel] {
                     NONE => ([0.0; 3], 0),

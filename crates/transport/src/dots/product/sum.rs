@@ -2,25 +2,23 @@ use ndarray::Array3;
 use pulp::Arch;
 use rayon::prelude::*;
 
-use crate::dots::shape::BLOCK_PX;
+use crate::dots::shape::WORD_PX;
 use crate::dots::{Batch, FrameShape};
 
 /// Number of dots whose residuals are summed sequentially. These partial sums are then added in order, so that the
 /// result is the same to the bit for any number of threads.
 const DOTS_AT_A_TIME: usize = 128;
 
-/// Computes images by rows of blocks, in parallel. `draw` gets the index of the row of blocks and a zeroed
-/// accumulator of its pixels, `[images, channels, rows, width]`.
+/// Computes images by bands, in parallel. `draw` gets the index of the band and a zeroed accumulator of its pixels, `[images, channels, rows, width]`.
 pub(super) fn by_bands<const IMAGES: usize>(
     shape: FrameShape,
     channels: usize,
     draw: impl Fn(usize, &mut [f64]) + Sync,
 ) -> [Array3<f32>; IMAGES] {
-    let of_band = BLOCK_PX * shape.width() * channels;
+    let of_band = WORD_PX * shape.width() * channels;
     let mut images: [Array3<f32>; IMAGES] =
         std::array::from_fn(|_| Array3::zeros((shape.height(), shape.width(), channels)));
-    let mut bands: Vec<Vec<&mut [f32]>> =
-        (0..shape.block_rows()).map(|_| Vec::with_capacity(IMAGES)).collect();
+    let mut bands: Vec<Vec<&mut [f32]>> = (0..shape.bands()).map(|_| Vec::with_capacity(IMAGES)).collect();
     for values in images.iter_mut().filter_map(Array3::as_slice_mut) {
         bands.iter_mut().zip(values.chunks_mut(of_band)).for_each(|(band, values)| band.push(values));
     }
@@ -77,23 +75,25 @@ pub(super) fn sum_blocks(batch: &Batch, planes: usize, add: impl Fn(usize, &mut 
     sums
 }
 
-/// Adds the values of a row of blocks, `[block columns]`, to all their pixels, `[rows, width]`.
+/// Adds the values of a band's blocks, `[block rows, block columns]`, to all their pixels, `[rows, width]`.
 #[inline(always)]
-pub(super) fn add_blocks(sums: &mut [f64], blocks: &[f64]) {
-    for row in sums.chunks_exact_mut(blocks.len() * BLOCK_PX) {
-        for (pixels, value) in row.chunks_exact_mut(BLOCK_PX).zip(blocks) {
+pub(super) fn add_blocks(sums: &mut [f64], blocks: &[f64], shape: FrameShape) {
+    for (row, pixels) in sums.chunks_exact_mut(shape.width()).enumerate() {
+        let of_row = &blocks[row / shape.block_px() * shape.block_columns()..];
+        for (pixels, value) in pixels.chunks_exact_mut(shape.block_px()).zip(of_row) {
             pixels.iter_mut().for_each(|pixel| *pixel += value);
         }
     }
 }
 
-/// First word of a row of blocks.
+/// First word of a band.
 pub(super) fn first_word(batch: &Batch, band: usize) -> usize {
     band * batch.shape().width()
 }
 
-/// First block of a row of blocks, and one past its last.
+/// First block of a band, and one past its last.
 pub(super) fn blocks_of(batch: &Batch, band: usize) -> std::ops::Range<usize> {
-    let columns = batch.shape().block_columns();
-    band * columns..(band + 1) * columns
+    let shape = batch.shape();
+    let of_band = WORD_PX / shape.block_px() * shape.block_columns();
+    band * of_band..shape.blocks().min((band + 1) * of_band)
 }
