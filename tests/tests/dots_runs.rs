@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
-use ndarray::{Array2, Array3, Array4, Axis, Zip, s};
+use ndarray::{Array2, Array3, Array4, Axis, Zip, concatenate, s};
 use raysweep::control::Control;
 use raysweep::{Probes, Runner};
 use raysweep_pipeline::dots::{ColumnStage, ColumnWorker};
@@ -385,4 +385,35 @@ fn videos_are_the_pictures_of_the_sequence_at_the_rate_of_the_batches() {
             assert!(rms < 8.0 && mean(&|difference| difference).abs() < 2.5, "{name} {image}: {rms}");
         }
     }
+}
+
+#[test]
+fn a_recording_may_end_before_its_plan_does() {
+    let plan = plan(FLOODLIT, 3).replace("[batches]\n", "[batches]\ncalibration = []\n");
+    let plan = plan.split("[[batches.calibration]]").next().unwrap();
+    // Beyond what any mirror may do: this one has done it already.
+    let large = plan.replace("[2.3, 1.3]", "[20, 11]");
+    let raw = plan.replace("dark_frames = 64", "dark_frames = 64\nkeep_raw = true");
+    let bench = Bench::dots(&rig(""));
+    let recorded = completed(&bench, &raw);
+    let frames: Array3<u16> = ndarray_npy::read_npy(recorded.open().0.raw_path()).unwrap();
+    let dark =
+        Array3::from_shape_fn((64, 128, 128), |(n, t, s)| 62 + ((7 * n + 5 * t + 3 * s + n * s) % 5) as u16);
+    let recording = concatenate![Axis(0), dark, frames];
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("recording.npy");
+    let played = |frames: usize| {
+        ndarray_npy::write_npy(&path, &recording.slice(s![..frames, .., ..])).unwrap();
+        let bench =
+            Bench::dots(&format!("kind = \"dots\"\n[camera]\ndriver = \"replay\"\nreplay.path = {path:?}\n"));
+        let ended = completed(&bench, &large);
+        let (session, state) = ended.open();
+        assert!(state.end.as_ref().unwrap().final_s.is_some());
+        let report = std::fs::read_to_string(session.report_path()).unwrap();
+        (state.batches().count(), report.contains("the recording ends after"))
+    };
+    assert_eq!(played(recording.dim().0), (3, false));
+    // A trailing dot more than the batches need.
+    assert_eq!(played(64 + 4 * 300 + 40), (3, false));
+    assert_eq!(played(64 + 2 * 300 + 140), (1, true));
 }

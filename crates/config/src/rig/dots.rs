@@ -215,6 +215,15 @@ fn default_white_exposure_us() -> f64 {
 fn default_full_scale() -> f64 {
     MirrorLimits::A7B2_3_3600AL.max_tilt.0
 }
+/// Any tilt that can throw a beam forwards.
+const OF_RECORDINGS: MirrorLimits = MirrorLimits {
+    max_tilt: MechanicalDeg(44.0),
+    max_step: MechanicalDeg(88.0),
+    max_slew_deg_per_s: 1e12,
+    bandwidth_hz: 1e12,
+    out_of_band: MechanicalDeg(88.0),
+};
+
 fn default_limits() -> MirrorLimits {
     MirrorLimits::A7B2_3_3600AL
 }
@@ -281,9 +290,9 @@ impl DotRigFile {
         document.finish(Some(rig))
     }
 
-    /// Limits of its mirror's paths.
+    /// Limits of its mirror's paths; none for a recording, whose mirror has moved already.
     pub fn limits(&self) -> MirrorLimits {
-        self.mirror.as_ref().map_or_else(default_limits, |mirror| mirror.limits)
+        self.mirror.as_ref().map_or(OF_RECORDINGS, |mirror| mirror.limits)
     }
 
     /// Angle between the beam and the mirror's normal at rest.

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use raysweep_core::{Camera, DeviceError, DeviceErrorKind, Frame, FramePool, LossCause};
+use raysweep_core::{Camera, DeviceError, DeviceErrorKind, DeviceState, Frame, FramePool, LossCause};
 use raysweep_pipeline::QueueError;
 use raysweep_pipeline::dots::{Arrival, Loss};
 
@@ -99,7 +99,9 @@ impl Source<'_> {
                 None => spare.take().unwrap_or_else(|| self.pool.spare()),
             };
             let Some(stamp) = self.camera.next_frame(&mut data, POLL)? else {
-                if before == NextWanted::Rest {
+                // A recording is over: an armed camera streams.
+                let is_over = self.camera.state() == DeviceState::Ready;
+                if before == NextWanted::Rest || is_over {
                     return Ok(lost);
                 }
                 if waiting_since.get_or_insert_with(Instant::now).elapsed() > PATIENCE {

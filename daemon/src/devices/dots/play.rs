@@ -36,6 +36,11 @@ impl Player<'_> {
         Ok(operator::place(&self.stand, subject, planes, self.orders, self.board)?)
     }
 
+    /// Whether the camera is a recording, which may end.
+    pub fn is_recorded(&self) -> bool {
+        matches!(self.stand, Stand::Recorded)
+    }
+
     /// Plays a path `rounds` times while the camera takes its frames. Ends with the path or, without a mirror, after
     /// `frames` frames; earlier if `enough` is set or the run is told to end. Returns what was lost after the last
     /// frame.

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
 
 use raysweep_config::BatchesPlan;
 use raysweep_core::{Counts, FramePool, SettingsId, Subject};
@@ -36,6 +37,8 @@ pub struct Acquired {
     pub problems: Vec<String>,
     /// The fault that ended acquisition early, if any.
     pub fault: Option<RunError>,
+    /// Time from the last frame until all batches were on disk; `None` without frames.
+    pub final_s: Option<f64>,
 }
 
 /// Acquires all batches.
@@ -83,6 +86,7 @@ pub fn acquire(
         orders: &run.orders,
         storage: &storage,
         waiting,
+        last_frame: None,
         player: Player {
             orders: &run.orders,
             board: &run.board,
@@ -95,6 +99,7 @@ pub fn acquire(
         },
     };
     let passed = passes.all();
+    let last_frame = passes.last_frame;
     let _ = run.board.go(RunState::Draining);
     // Turn the light off before anything else ends.
     drop(motion);
@@ -102,8 +107,9 @@ pub fn acquire(
         tracing::warn!(%error, "camera not disarmed");
     }
     let StoredBatches { ledger, problems, error } = storage.finish()?;
+    let final_s = last_frame.map(|last| last.elapsed().as_secs_f64());
     let fault = error.map(RunError::from).or(passed.err());
-    Ok(Acquired { session: run.session, ledger, problems, fault })
+    Ok(Acquired { session: run.session, ledger, problems, fault, final_s })
 }
 
 struct DotPasses<'a> {
@@ -116,6 +122,8 @@ struct DotPasses<'a> {
     storage: &'a BatchSink,
     /// Queue length for frames between the camera and the workers.
     waiting: usize,
+    /// When the last frame of a batch came.
+    last_frame: Option<Instant>,
     player: Player<'a>,
 }
 
@@ -247,8 +255,20 @@ impl DotPasses<'_> {
         let blind = flow.is_blind();
         let rounds = BatchesPlan::rounds(batches);
         let frames = u64::from(rounds) * u64::from(plan.dots);
-        let played =
-            self.player.play(&task.path, rounds, frames, &blind, &mut |arrival| Ok(input.offer(arrival)?));
+        let (mut taken, mut last_frame) = (0_u64, None);
+        let played = self.player.play(&task.path, rounds, frames, &blind, &mut |arrival| {
+            taken += 1;
+            last_frame = Some(Instant::now());
+            Ok(input.offer(arrival)?)
+        });
+        self.last_frame = last_frame.or(self.last_frame);
+        let needed = u64::from(batches) * u64::from(plan.dots);
+        if self.player.is_recorded() && taken < needed && played.is_ok() && self.orders.go_on() {
+            self.storage.problem(format!(
+                "the recording ends after {taken} of the {needed} frames of {}",
+                plane.map_or("the scene".into(), |plane| format!("plane {}", plane + 1))
+            ));
+        }
         drop(input);
         let Gathered { sink, background, error } = flow.join()?;
         let mut rest = Counts::default();

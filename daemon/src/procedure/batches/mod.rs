@@ -76,11 +76,13 @@ impl Measurement for BatchesRun {
     fn measure(self: Box<Self>, run: Run) -> Result<Ended, RunError> {
         let Self { rig, task, probes } = *self;
         let orders = run.orders.clone();
-        let Acquired { session, mut ledger, mut problems, fault } = acquire(&rig, &task, &probes, run)?;
+        let Acquired { session, mut ledger, mut problems, fault, final_s } =
+            acquire(&rig, &task, &probes, run)?;
         let stored = ledger.state().stored_points();
         let state = end_state(fault.as_ref(), &orders);
         let end = EndEntry {
             error: fault.map(|fault| fault.to_string()),
+            final_s,
             ..end_entry(state, stored, ledger.state().missing_points())
         };
         ledger.append(&Entry::End(end.clone()))?;

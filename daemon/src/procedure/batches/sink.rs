@@ -32,6 +32,8 @@ enum Item {
     Outside(Counts),
     /// An entry for the ledger.
     Note(Entry),
+    /// What the results may suffer from.
+    Problem(String),
 }
 
 /// Handle of the writer's thread.
@@ -104,6 +106,11 @@ impl BatchSink {
     /// Records an entry that no batch depends on.
     pub fn note(&self, entry: Entry) {
         let _ = self.items.send(Item::Note(entry));
+    }
+
+    /// Notes what the results may suffer from.
+    pub fn problem(&self, problem: String) {
+        let _ = self.items.send(Item::Problem(problem));
     }
 
     /// Waits until everything is written.
@@ -218,6 +225,7 @@ impl BatchWriter {
                     self.append(&Entry::Outside { counts });
                 }
                 Item::Note(entry) => self.append(&entry),
+                Item::Problem(problem) => self.problems.push(problem),
             }
             self.writing.board.publish(Event::Progress(self.progress.shown()));
         }
