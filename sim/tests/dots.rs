@@ -235,6 +235,37 @@ fn dots_are_where_the_mechanics_take_the_beam() {
 }
 
 #[test]
+fn a_mirror_drifts_on_from_pass_to_pass() {
+    const DRIFT_DEG_PER_S: f64 = 0.05;
+    let config = DotsConfig {
+        mirror: SimMirror { drift_deg_per_s: [DRIFT_DEG_PER_S, 0.0], ..SimMirror::default() },
+        trailing_index: Some(9999),
+        ..exact()
+    };
+    let rate_hz = 10_000.0;
+    let path = visit(&[[0.5, 0.5]], 1000, rate_hz, &config);
+    let rig = rig(config.clone());
+    let mut devices = rig.open(1000.0, None);
+    devices.subject.place(Subject::Plane(0)).unwrap();
+    let mut first = || {
+        let frames = record(&mut devices, &path, 2);
+        centroid(&frames[0].counts, rig.scene_rows(), rig.size().1)
+    };
+    let places = [first(), first(), first()];
+    // Half a second of rest on the first point, and two rounds.
+    let deg = DRIFT_DEG_PER_S * (0.5 + 0.2);
+    let px_per_tangent = rig.size().1 as f64 / (2.0 * (config.fov_deg[0] / 2.0).to_radians().tan());
+    let expected_px = (2.0 * deg).to_radians().tan() * px_per_tangent;
+    for pass in 1..3 {
+        let [down, right] = [0, 1].map(|axis| places[pass][axis] - places[pass - 1][axis]);
+        assert!(
+            (right - expected_px).abs() < 0.1 && down.abs() < 0.1,
+            "{pass}: {right}, {expected_px}, {down}"
+        );
+    }
+}
+
+#[test]
 fn the_same_dot_lies_elsewhere_on_a_plane_at_another_depth() {
     let config = exact();
     let path = visit(&[[0.3, 0.4], [0.7, 0.6], [0.5, 0.5]], 4, 40_000.0, &config);

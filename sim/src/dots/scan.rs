@@ -50,19 +50,20 @@ struct Motion {
 }
 
 impl MirrorScan {
-    /// Plays a path `batches` times, with frames at `frame_rate_hz`.
+    /// Plays a path `batches` times, with frames at `frame_rate_hz`, `begins_s` after the mirror's first movement.
     pub fn new(
         path: MirrorPath,
         batches: u32,
         frame_rate_hz: f64,
         incidence: MechanicalDeg,
+        begins_s: f64,
         config: &DotsConfig,
     ) -> Self {
         let rate_hz = path.rate_hz();
         let samples_per_dot = rate_hz / frame_rate_hz;
         let dots = (path.points().len() as f64 / samples_per_dot).round() as u64;
         let motion = config.mirror.mechanics.then(|| {
-            let mut mechanics = Mechanics::new(mechanics(&config.mirror, config.seed), rate_hz);
+            let mut mechanics = Mechanics::new(mechanics(&config.mirror, config.seed, begins_s), rate_hz);
             let first = path.at(0).tilt;
             let mut place = first;
             for _ in 0..(SETTLE_S * rate_hz) as u32 {
@@ -96,6 +97,12 @@ impl MirrorScan {
     /// Number of samples in all batches.
     pub fn samples(&self) -> u64 {
         self.samples
+    }
+
+    /// Time that it takes with what comes before it, as planned: a pass that is ended early counts as whole, so that
+    /// frames do not depend on when.
+    pub fn planned_s(&self) -> f64 {
+        SETTLE_S + self.samples as f64 / self.rate_hz()
     }
 
     /// Number of frames triggered during all batches.
@@ -174,7 +181,7 @@ impl Motion {
 }
 
 /// The mechanics of a mirror as the rig file describes it.
-fn mechanics(mirror: &SimMirror, seed: u64) -> MechanicsConfig {
+fn mechanics(mirror: &SimMirror, seed: u64, begins_s: f64) -> MechanicsConfig {
     MechanicsConfig {
         f0_hz: mirror.f0_hz,
         q: mirror.q,
@@ -183,6 +190,7 @@ fn mechanics(mirror: &SimMirror, seed: u64) -> MechanicsConfig {
         drift_deg_per_s: mirror.drift_deg_per_s,
         repeat_deg: mirror.repeat_deg,
         seed,
+        begins_s,
         ..MechanicsConfig::default()
     }
 }

@@ -208,14 +208,16 @@ impl World {
 
     /// Starts a path whose first sample is played at `start_ns`, if already known.
     pub fn start(&self, path: MirrorPath, batches: u32, start_ns: Option<i64>) {
+        let mut state = self.lock();
+        let begins_s = state.records.iter().map(|record| record.scan.planned_s()).sum();
         let scan = MirrorScan::new(
             path,
             batches,
             self.frame_rate_hz,
             self.bench.setup.incidence,
+            begins_s,
             &self.bench.config,
         );
-        let mut state = self.lock();
         let (number, subject) = (state.records.len() as u64, state.subject);
         let end = scan.samples() as f64;
         state.records.push(Record { number, scan, subject, start_ns, end, first: None });

@@ -38,6 +38,8 @@ pub struct MechanicsConfig {
     pub repeat_s: f64,
     /// Seed of the repeatability error.
     pub seed: u64,
+    /// Time since the mirror's first movement at which this one begins: drift goes on, and errors are drawn anew.
+    pub begins_s: f64,
 }
 
 impl Default for MechanicsConfig {
@@ -52,6 +54,7 @@ impl Default for MechanicsConfig {
             repeat_deg: 0.0,
             repeat_s: 1.0 / 6.0,
             seed: 1,
+            begins_s: 0.0,
         }
     }
 }
@@ -109,7 +112,7 @@ impl Mechanics {
             moved[axis] = self.state[axis][STATES - 2];
         }
         self.samples += 1;
-        let seconds = self.samples as f64 / self.rate_hz;
+        let seconds = self.config.begins_s + self.samples as f64 / self.rate_hz;
         self.draw_offset((seconds / self.config.repeat_s) as u64);
         let [x, y] = moved;
         let [drift_x, drift_y] = self.config.drift_deg_per_s.map(|drift| drift * seconds);
