@@ -7,7 +7,6 @@ mod deb;
 mod demo;
 mod fresh;
 mod guest;
-mod live;
 mod packages;
 mod python;
 mod rootfs;

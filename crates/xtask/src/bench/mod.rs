@@ -1,7 +1,11 @@
 //! `cargo xtask bench`: benchmarks.
 
+mod live;
+mod times;
+mod view;
+
+use crate::python;
 use crate::run::{Done, cargo, run, target};
-use crate::{live, python};
 
 const BENCHES: &str = "\
 benchmarks: cargo xtask bench <name> [options]
@@ -24,7 +28,18 @@ benchmarks: cargo xtask bench <name> [options]
           --only CASE  the cases alone whose names have this in them: 512x512, \"packets of 9000\"
           --json   JSON lines
   edges   the logic analyser's edge scan on one core: samples a second against its 24 MHz, quiet to worst
+  view    what live pictures take of the daemon, of which `raysweep view` shows some to a browser: processor time of a
+          viewfinder of 1280x720 pixels at 15 pictures a second and of a film of 128x128, alone and watched
+          --json   JSON lines
   unpack  packed pixels to u16: share of the speed of a memcpy of the same output, by format and instructions";
+
+/// Output format.
+enum Print {
+    /// Text for people.
+    Text,
+    /// JSON lines for programs.
+    JsonLines,
+}
 
 /// Runs the benchmark named by the first argument with the options that follow; without arguments, lists all
 /// benchmarks.
@@ -49,9 +64,12 @@ pub fn bench(arguments: &[&str]) -> Done {
         ["edges"] => run(cargo().args(["bench", "--package", "raysweep-drivers", "--bench", "edges"])),
         ["edges", option, ..] => Err(format!("`edges` has no option `{option}`\n{BENCHES}")),
         ["camera", options @ ..] => camera(options),
-        ["live"] => live::live(live::Print::Text),
-        ["live", "--json"] => live::live(live::Print::JsonLines),
+        ["live"] => live::live(Print::Text),
+        ["live", "--json"] => live::live(Print::JsonLines),
         ["live", unknown, ..] => Err(format!("`live` has no option `{unknown}`\n{BENCHES}")),
+        ["view"] => view::view(Print::Text),
+        ["view", "--json"] => view::view(Print::JsonLines),
+        ["view", unknown, ..] => Err(format!("`view` has no option `{unknown}`\n{BENCHES}")),
         [unknown, ..] => Err(format!("no benchmark `{unknown}`\n{BENCHES}")),
     }
 }
@@ -114,11 +132,12 @@ mod tests {
 
     #[test]
     fn unknown_names_and_options_are_told_what_there_is() {
-        let unknown: [&[&str]; 8] = [
+        let unknown: [&[&str]; 9] = [
             &["demuxx"],
             &["demux", "--fast"],
             &["dots", "--live", "--fast"],
             &["live", "--fast"],
+            &["view", "--fast"],
             &["unpack", "--json"],
             &["edges", "--json"],
             &["camera", "--peers"],

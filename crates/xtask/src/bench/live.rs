@@ -1,11 +1,12 @@
 //! `cargo xtask bench live`: the daemon on the simulated rig in real time.
 
-use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Instant;
 
+use super::Print;
+use super::times::{cpu_s, spent_s};
 use crate::daemon::Daemon;
 use crate::run::{Done, cargo, root, run, target};
 
@@ -15,22 +16,8 @@ const SIDES_PX: [u32; 2] = [128, 512];
 /// frame and have no other work before that; pool threads carry the daemon's name.
 const SIMULATOR: [&str; 3] = ["camera", "vsync", "raysweepd"];
 
-/// Clock ticks per second of `/proc/PID/task/TID/stat`: 100 on all Linux machines for decades.
-const TICKS_PER_S: f64 = 100.0;
-
 /// The event that follows the last frame.
 const DRAINING: &str = "\"draining\"";
-
-/// Name and processor time in seconds, by thread.
-type Times = BTreeMap<String, (String, f64)>;
-
-/// Output format.
-pub enum Print {
-    /// Text for people.
-    Text,
-    /// JSON lines for programs.
-    JsonLines,
-}
 
 /// Measurements of a run.
 struct Ran {
@@ -126,30 +113,6 @@ fn ran(rig: &Path, plan: &Path, folder: &Path) -> Done<Ran> {
     }
 }
 
-/// Processor time since `before` of the threads selected by name.
-fn spent_s(before: &Times, latest: &Times, wanted: impl Fn(&str) -> bool) -> f64 {
-    let threads = latest.iter().filter(|(_, (name, _))| wanted(name));
-    threads.map(|(thread, (_, s))| s - before.get(thread).map_or(0.0, |(_, s)| *s)).sum()
-}
-
-/// Name and processor time of each running thread of a process.
-fn cpu_s(process: u32) -> Times {
-    let threads = std::fs::read_dir(format!("/proc/{process}/task")).into_iter().flatten().flatten();
-    let times = threads.filter_map(|thread| {
-        let stat = std::fs::read_to_string(thread.path().join("stat")).ok()?;
-        Some((thread.file_name().to_string_lossy().into_owned(), name_and_cpu_s(&stat)?))
-    });
-    times.collect()
-}
-
-/// Parses a line of `stat`. Names may contain spaces and parentheses, so fields are counted from the last parenthesis.
-fn name_and_cpu_s(stat: &str) -> Option<(String, f64)> {
-    let name = stat.get(stat.find('(')? + 1..stat.rfind(')')?)?;
-    let mut fields = stat.get(stat.rfind(')')? + 1..)?.split_whitespace().skip(11);
-    let mut ticks = || fields.next()?.parse::<f64>().ok();
-    Some((name.to_owned(), (ticks()? + ticks()?) / TICKS_PER_S))
-}
-
 fn number_after(line: &str, key: &str) -> Option<f64> {
     let rest = line.split_once(key)?.1.trim_start();
     rest.split([',', '}']).next()?.trim().parse().ok()
@@ -158,13 +121,6 @@ fn number_after(line: &str, key: &str) -> Option<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn a_thread_s_time_is_read_whatever_its_name() {
-        let stat = "77 (a (b) c) S 1 2 3 4 5 6 7 8 9 10 150 50 0 0 20 0 1 0 99";
-        assert_eq!(name_and_cpu_s(stat), Some(("a (b) c".into(), 2.0)));
-        assert_eq!(name_and_cpu_s("77 (short) S 1"), None);
-    }
 
     #[test]
     fn the_seconds_are_read_from_the_last_event() {
