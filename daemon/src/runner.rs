@@ -475,11 +475,13 @@ impl Control for Runner {
     }
 
     fn doctor(&self, params: &DoctorParams) -> Result<DoctorReport, RpcError> {
-        let plan = params.plan.as_ref().map(|plan| self.foresee(plan)).transpose()?;
-        let needs = plan.map(|Foreseen { report, .. }| PlanNeeds {
-            disk_bytes: report.disk_bytes,
-            light_s: report.light_s,
-        });
+        let foresee = |plan| {
+            let report = self.foresee(plan)?.report;
+            Ok(PlanNeeds { disk_bytes: report.disk_bytes, light_s: report.light_s })
+        };
+        let state = || self.board.status().state;
+        let needs = params.plan.as_ref();
+        let needs = needs.map(|plan| self.computing.between_runs(state, || foresee(plan))).transpose()?;
         self.reserved(|orders| {
             let report = doctor::examine(&self.rig, &self.data, needs, &|| orders.go_on());
             Ok((report, None))
@@ -554,32 +556,15 @@ impl Control for Runner {
         if !self.data.exists() {
             return Ok(Vec::new());
         }
-        let listing =
-            self.computing.now(|| raysweep_session::list(&self.data)).map_err(|error| storage(&error))?;
-        let in_use = CalibrationHeader::read(&current_in(&self.data)).ok().flatten();
-        let measured = listing.sessions.into_iter().filter(|session| session.kind == CALIBRATION);
-        let info = |session: SessionSummary| {
-            let name = session.dir.file_name().unwrap_or_default().to_string_lossy().into_owned();
-            let (header, problem) = match CalibrationHeader::read(&session.dir) {
-                Ok(header @ Some(_)) => (header, None),
-                Ok(None) => (None, Some("its run did not succeed: see its report and ledger".into())),
-                Err(problem) => (None, Some(problem)),
-            };
-            CalibrationInfo {
-                session: session.dir,
-                made: header.as_ref().map_or_else(String::new, |header| header.made.to_string()),
-                camera: header.map_or_else(String::new, |header| header.valid_for.camera),
-                in_use: in_use.as_ref().is_some_and(|in_use| in_use.session == name),
-                problem,
-            }
-        };
-        Ok(measured.map(info).collect())
+        self.computing.now(|| calibrations_in(&self.data)).map_err(|error| storage(&error))
     }
 
     fn use_calibration(&self, session: &Path) -> Result<(), RpcError> {
         let session = self.session(session)?;
         let folder = session.dir().to_owned();
-        if let Some(damage) = damaged_calibration(&session).map_err(|error| storage(&error))? {
+        // All results are read to hold them against their checksums.
+        let damage = self.computing.now(|| damaged_calibration(&session)).map_err(|error| storage(&error))?;
+        if let Some(damage) = damage {
             let advice = "`raysweep process` with --accept-damage makes it again";
             return Err(no_session(format!("{}: {damage}; {advice}", folder.display())));
         }
@@ -608,6 +593,29 @@ impl Control for Runner {
     fn events(&self) -> broadcast::Receiver<Event> {
         self.board.subscribe()
     }
+}
+
+/// The calibrations among the sessions of a data folder.
+fn calibrations_in(data: &Path) -> raysweep_session::Result<Vec<CalibrationInfo>> {
+    let listing = raysweep_session::list(data)?;
+    let in_use = CalibrationHeader::read(&current_in(data)).ok().flatten();
+    let measured = listing.sessions.into_iter().filter(|session| session.kind == CALIBRATION);
+    let info = |session: SessionSummary| {
+        let name = session.dir.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let (header, problem) = match CalibrationHeader::read(&session.dir) {
+            Ok(header @ Some(_)) => (header, None),
+            Ok(None) => (None, Some("its run did not succeed: see its report and ledger".into())),
+            Err(problem) => (None, Some(problem)),
+        };
+        CalibrationInfo {
+            session: session.dir,
+            made: header.as_ref().map_or_else(String::new, |header| header.made.to_string()),
+            camera: header.map_or_else(String::new, |header| header.valid_for.camera),
+            in_use: in_use.as_ref().is_some_and(|in_use| in_use.session == name),
+            problem,
+        }
+    };
+    Ok(measured.map(info).collect())
 }
 
 /// What of a session's calibration is damaged, if anything.

@@ -5,8 +5,12 @@ use std::path::{Path, PathBuf};
 
 use raysweep_config::AnyRigFile;
 use raysweep_proto::SessionInfo;
+use raysweep_session::Session;
 
 use super::CommandFailure;
+
+/// A run that ends the daemon again and again would otherwise be resumed, with its light, for ever.
+const MOST_BARREN_RESUMES: u32 = 3;
 
 /// The newest session if it was cut off and may be resumed with nobody present; otherwise, why there is none.
 ///
@@ -36,6 +40,16 @@ pub(super) fn cut_off(sessions: &[SessionInfo]) -> Result<Result<PathBuf, String
             name(&newest.session)
         )));
     }
+    let state = Session::open(&newest.session).and_then(|session| session.state());
+    if let Ok(state) = state
+        && state.barren_resumes >= MOST_BARREN_RESUMES
+    {
+        return Ok(Err(format!(
+            "{shown} was resumed {} times without storing a point: see why in the journal, then `raysweep resume {}`",
+            state.barren_resumes,
+            name(&newest.session)
+        )));
+    }
     Ok(Ok(newest.session.clone()))
 }
 
@@ -45,6 +59,9 @@ fn name(session: &Path) -> String {
 
 #[cfg(test)]
 mod tests {
+    use raysweep_session::ledger::{Entry, FORMAT, SessionEntry};
+    use raysweep_session::stack::{Contents, StackShape};
+
     use super::*;
 
     const PERMITTED: &str = "kind = \"plane\"\nauto_resume = true\ncamera.driver = \"sim\"\nvsync.driver = \"sim\"\nprojector.driver = \"sim\"\n";
@@ -79,6 +96,34 @@ mod tests {
         assert!(why("unfinished", &forbidden, sweep).contains("auto_resume"));
         assert!(why("unfinished", PERMITTED, "kind = \"darks\"").contains("only sweeps"));
         assert!(cut_off(&[]).unwrap().is_err());
+    }
+
+    #[test]
+    fn a_run_that_gets_nowhere_is_left_alone_after_three_attempts() {
+        let data = tempfile::tempdir().unwrap();
+        let shape = StackShape { contents: Contents::Sweep { points: 2, exposures: 1 }, rows: 2, columns: 2 };
+        let entry = SessionEntry {
+            format: FORMAT,
+            name: "a".into(),
+            kind: "sweep".into(),
+            operator: None,
+            sample: None,
+            note: None,
+            tags: Vec::new(),
+            created: "2026-03-04T05:06:07Z".parse().unwrap(),
+            software: "raysweep".into(),
+            shape,
+            first_row: 0,
+        };
+        let (created, mut ledger) =
+            Session::create(data.path(), entry, "kind = \"sweep\"", PERMITTED).unwrap();
+        let listed = [session(created.dir(), "unfinished", PERMITTED, "kind = \"sweep\"")];
+        for resumed in [false, true, true] {
+            ledger.append(&Entry::Run { started: jiff::Timestamp::now(), resumed }).unwrap();
+            assert!(cut_off(&listed).unwrap().is_ok());
+        }
+        ledger.append(&Entry::Run { started: jiff::Timestamp::now(), resumed: true }).unwrap();
+        assert!(cut_off(&listed).unwrap().unwrap_err().contains("3 times"));
     }
 
     #[test]

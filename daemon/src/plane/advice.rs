@@ -97,7 +97,8 @@ const ASSUMED: Calibrated = Calibrated { latency_us: 0.3, edge_us: 0.5, exposure
 /// To what a sweep finds the latency from its own images.
 const REFINED_LATENCY_US: f64 = 0.3;
 
-/// How well a task's rig is known: as its calibration says, if it has one. Edges are known to what VSYNC stamps leave.
+/// How well a task's rig is known: as its calibration says, if it has one. Edges are known to what VSYNC stamps leave,
+/// unless a strip of the board in view shows each of them.
 fn known<T: Searched>(of: &T) -> Calibrated {
     let Some(calibration) = &of.task().geometry.calibration else { return ASSUMED };
     let sd = |parameter| calibration.covariance.sd(parameter);
@@ -107,7 +108,10 @@ fn known<T: Searched>(of: &T) -> Calibrated {
             Arrangement::Sweep => latency_us.min(REFINED_LATENCY_US),
             Arrangement::Film => latency_us,
         },
-        edge_us: calibration.jitter_us,
+        edge_us: match calibration.strip {
+            Some(_) => calibration.jitter_us.min(ASSUMED.edge_us),
+            None => calibration.jitter_us,
+        },
         exposure_us: sd(CalibrationParameter::ExposureOffset),
         place_rows: sd(CalibrationParameter::Place),
     }

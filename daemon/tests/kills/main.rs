@@ -86,7 +86,8 @@ fn kill_all(number: usize, kind: &Kind, kills: usize) -> Vec<(String, Row)> {
     let victims = Victim::of(kind);
     let mut rows: Vec<_> =
         victims.iter().map(|victim| (format!("{}, {victim:?}", kind.name), Row::default())).collect();
-    let mut random = Xoshiro256PlusPlus::seed_from_u64(number as u64);
+    let seed = std::env::var("RAYSWEEP_KILLS_SEED").map_or(0, |seed| seed.parse::<u64>().unwrap());
+    let mut random = Xoshiro256PlusPlus::seed_from_u64((seed << 8) + number as u64);
     for kill in 0..kills {
         let turn = kill % victims.len();
         let (verdict, when) = match victims[turn] {

@@ -60,7 +60,7 @@ pub struct CalibrationHeader {
     pub valid_for: ValidFor,
     /// Times.
     pub timing: CalibratedTiming,
-    /// CalibratedLight and sensor.
+    /// Light and sensor.
     pub light: CalibratedLight,
     /// The room's light; `None` if it was not measured.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -109,7 +109,7 @@ pub struct CalibratedTiming {
     pub latency_exposure_covariance_us2: Option<f64>,
 }
 
-/// CalibratedLight and sensor.
+/// Light and sensor.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CalibratedLight {

@@ -17,6 +17,8 @@ pub struct State {
     pub session: SessionEntry,
     /// Number of acquisition runs begun.
     pub runs: u32,
+    /// How many times in a row, up to the ledger's end, a resumed run stored no point.
+    pub barren_resumes: u32,
     /// All frames of all runs, including repeated and failed attempts.
     pub counts: Counts,
     /// How the latest run ended; `None` before the first, while one is running and after a crash.
@@ -46,6 +48,7 @@ impl State {
         let mut state = State {
             session: session.clone(),
             runs: 0,
+            barren_resumes: 0,
             counts: Counts::default(),
             end: None,
             film: None,
@@ -220,11 +223,13 @@ impl State {
         match entry {
             Entry::Session(_) => {}
             Entry::Files { sha256 } => self.files.extend(sha256.clone()),
-            Entry::Run { .. } => {
+            &Entry::Run { resumed, .. } => {
                 self.runs += 1;
+                self.barren_resumes = if resumed { self.barren_resumes + 1 } else { 0 };
                 self.end = None;
             }
             Entry::Point(point) => {
+                self.barren_resumes = 0;
                 self.counts.add(&point.counts);
                 self.note_attempt(point.array, point.index, point.attempt);
                 self.stored.insert((point.array, point.index), point.clone());

@@ -162,6 +162,19 @@ fn a_corrupt_line_in_the_middle_is_named() {
 }
 
 #[test]
+fn resumed_runs_without_a_point_are_counted_until_one_is_stored() {
+    let run = |resumed| Entry::Run { started: "2026-03-04T05:06:08Z".parse().unwrap(), resumed };
+    let (_dir, path) = ledger_with(&[run(false), point(0, 0)]);
+    let mut ledger = Ledger::open(&path).unwrap();
+    let mut barren = Vec::new();
+    for entry in [run(true), failed(1, 0), run(true), run(true), point(1, 1), run(true), run(false)] {
+        ledger.append(&entry).unwrap();
+        barren.push(ledger.state().barren_resumes);
+    }
+    assert_eq!(barren, [1, 1, 2, 3, 0, 1, 0]);
+}
+
+#[test]
 fn ledgers_that_make_no_sense_are_errors() {
     let (_dir, path) = ledger_with(&[]);
     let first = fs::read_to_string(&path).unwrap();

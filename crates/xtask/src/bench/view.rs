@@ -55,7 +55,7 @@ struct Taken {
 
 /// Builds the programs and measures each case alone, then watched.
 pub fn view(print: Print) -> Done {
-    let build = ["build", "--package", "raysweep", "--bins", "--features", "aravis", "--release"];
+    let build = ["build", "--package", "raysweep", "--bins", "--all-features", "--release"];
     run(cargo().args(build))?;
     for case in &CASES {
         let folder = target().join("bench-view").join(case.picture);
