@@ -1,4 +1,29 @@
-// Colours of the plots.
+// Plots in the page's colours, as wide as their place.
 
-export const axisColour = () => (matchMedia("(prefers-color-scheme: dark)").matches ? "#9aa4b0" : "#5a6470");
-export const gridColour = () => (matchMedia("(prefers-color-scheme: dark)").matches ? "#343a42" : "#e3e6ea");
+const isDark = () => matchMedia("(prefers-color-scheme: dark)").matches;
+const axisColour = () => (isDark() ? "#9aa4b0" : "#5a6470");
+const gridColour = () => (isDark() ? "#343a42" : "#e3e6ea");
+const LINES = [["#0b62a8", "#6cb4f0"], ["#b35c00", "#e8b75a"], ["#2d7d46", "#7fcf9a"], ["#8b3a8b", "#d99ad9"],
+  ["#a02c2c", "#f09090"]];
+
+/** A line of a plot, in the colour of its number. */
+export const line = (at, label, options = {}) =>
+  ({ label, stroke: () => LINES[at % LINES.length][+isDark()], width: 1.5, points: { show: false }, ...options });
+
+/** Plots lines over x; `y` and `x` are the axes' labels. */
+export function plotIn(place, { x, y, lines, height = 220, legend = false, range = null }, data) {
+  const [stroke, grid] = [axisColour, { stroke: gridColour }];
+  const axis = (label) => ({ label, labelSize: 20, stroke, grid, ticks: grid });
+  const watch = new ResizeObserver(() => {
+    if (place.clientWidth) plot.setSize({ width: place.clientWidth, height });
+  });
+  const plot = new uPlot({
+    width: place.clientWidth, height, legend: { show: legend },
+    scales: { x: { time: false }, y: range ? { range } : {} },
+    axes: [axis(x), { ...axis(y), size: 56 }],
+    series: [{ label: x }, ...lines],
+    hooks: { destroy: [() => watch.disconnect()] },
+  }, data, place);
+  watch.observe(place);
+  return plot;
+}
