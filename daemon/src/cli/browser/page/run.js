@@ -18,6 +18,8 @@ const words = (name) => name.replaceAll("_", " ");
 const nameOf = (folder) => folder?.split("/").pop();
 
 let status = {};
+/** What was last asked; at the end of a run nothing waits for it. */
+let asked = null;
 /** Why the last order was refused, until the next one. */
 let complaint = null;
 /** Jitter since the page was opened: seconds, standard deviation, 99th percentile. */
@@ -55,8 +57,13 @@ function hear(event) {
     case "progress": status.progress = event; draw(); break;
     case "vsync": addJitter(event); break;
     case "viewfinder": showFinder(event); break;
-    case "state": status.state = event.state; draw(); refresh(); break;
-    case "ask": status.question = event.text; draw(); refresh(); break;
+    case "state":
+      status.state = event.state;
+      if (["preparing", "running"].includes(event.state)) asked = null;
+      draw();
+      refresh();
+      break;
+    case "ask": asked = event.text; refresh(); break;
     case "finished": refresh(); break;
   }
 }
@@ -121,6 +128,7 @@ function draw() {
   const notes = complaint ? [note("bad", complaint)] : [];
   if (status.ended) notes.push(note(status.ended === "complete" ? "good" : "warn", `The run is ${status.ended}.`));
   if (status.error) notes.push(note("bad", status.error));
+  if (status.ended && asked) notes.push(note("warn", asked));
   notes.push(...(status.warnings ?? []).map((warning) => note("warn", warning)));
   if (status.ended && session) {
     const href = `session/${encodeURIComponent(nameOf(session))}/report`;
