@@ -75,18 +75,18 @@ export function showFinder(values) {
   if (document.activeElement !== by("finder-exposure")) by("finder-exposure").value = number(values.exposure_us);
   by("histogram-text").textContent = `0 to ${values.full_dn} counts; the line is saturation`;
   drawHistogram(by("histogram"), values);
-  drawCut("row-cut", values.row_cut, "column", [left, right], `Along row ${Math.floor((top + bottom) / 2)}`);
-  drawCut("column-cut", values.column_cut, "row", [top, bottom], `Along column ${Math.floor((left + right) / 2)}`);
+  drawCut("row-cut", values.row_cut, [left, right], `Counts along row ${Math.floor((top + bottom) / 2)}`);
+  drawCut("column-cut", values.column_cut, [top, bottom], `Counts along column ${Math.floor((left + right) / 2)}`);
 }
 
 /** Plots counts along a line from `first` to before `end`; each is the mean of as many neighbours. */
-function drawCut(id, counts, x, [first, end], title) {
+function drawCut(id, counts, [first, end], title) {
   if (!counts.length) return;
   by(`${id}-text`).textContent = title;
   const step = Math.ceil((end - first) / counts.length);
   const data = [counts.map((_, at) => first + at * step + (step - 1) / 2), counts];
   const range = (_, least, most) => [0, Math.max(most, 1) * 1.05];
-  cuts[id] ??= plotIn(by(id), { x, y: "counts", lines: [line(0, "counts")], height: 130, range }, data);
+  cuts[id] ??= plotIn(by(id), { lines: [line(0, "counts")], height: 110, range }, data);
   cuts[id].setData(data);
 }
 

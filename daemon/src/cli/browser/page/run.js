@@ -106,6 +106,9 @@ function draw() {
   by("continue").disabled = state !== "paused";
   by("cancel").disabled = !isUnderWay;
   for (const id of ["start", "check", "find"]) by(id).disabled = isUnderWay || !state;
+  // A viewfinder stores nothing.
+  const stores = Boolean(progress?.points_planned);
+  by("progress").hidden = !stores;
   by("progress").max = progress?.points_planned || 1;
   const point = progress?.under_way;
   by("progress").value = (progress?.points_stored ?? 0) + (point ? point.frames / point.of : 0);
@@ -130,7 +133,7 @@ function draw() {
   if (status.error) notes.push(note("bad", status.error));
   if (status.ended && asked) notes.push(note("warn", asked));
   notes.push(...(status.warnings ?? []).map((warning) => note("warn", warning)));
-  if (status.ended && session) {
+  if (status.ended && session && stores) {
     const href = `session/${encodeURIComponent(nameOf(session))}/report`;
     notes.push(element("p", {}, element("a", { href, target: "_blank", rel: "noopener" }, "Open the report")));
   }
@@ -201,7 +204,9 @@ async function watchPictures({ onregion, onmarks }) {
     });
   }
   const delays = startDelays();
-  const onpixel = (row, column) => delays(nameOf(shown?.about.session), row, column);
+  // A viewfinder has no delays.
+  const onpixel = (row, column) =>
+    delays(shown?.name === "viewfinder" ? null : nameOf(shown?.about.session), row, column);
   const picture = new Picture(by("live-picture"), {
     label: "Live picture",
     onpixel,

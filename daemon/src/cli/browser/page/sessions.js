@@ -23,7 +23,8 @@ export function startSessions({ watch }) {
   async function list() {
     // The text says why the sessions' files may not be read.
     const { result, error, text } = await call("sessions");
-    by("sessions-notes").replaceChildren(...[error?.message, text].filter(Boolean).map((why) => note("warn", why)));
+    const notes = [error?.message, text && `What sessions contain is not shown: ${text}.`];
+    by("sessions-notes").replaceChildren(...notes.filter(Boolean).map((why) => note("warn", why)));
     if (!result) return;
     listed = result.reverse().map((info) => ({ ...info, mayRead: !text }));
     drawList();
@@ -59,7 +60,8 @@ export function startSessions({ watch }) {
     const known = thumbnails.get(session);
     if (known?.shows === shows) return known.image;
     const src = mayRead ? address(nameOf(session), "/thumbnail") : null;
-    const image = element("img", { src, alt: "", loading: "lazy", width: "44", height: "44" });
+    const image = element("img", { src, alt: "", loading: "lazy", onerror: () => { image.className = "none"; } });
+    if (!mayRead) image.className = "none";
     thumbnails.set(session, { image, shows });
     return image;
   }
@@ -163,7 +165,7 @@ function profile(place, sessions) {
     try {
       return await read(address(nameOf(session.session), `/pixel/${row}/${column}`));
     } catch (error) {
-      notes.append(note("warn", `${session.name}: ${error.message}`));
+      notes.append(note("warn", `${nameOf(session.session)}: ${error.message}`));
       return { u_min: 0, light: [] };
     }
   };
@@ -175,7 +177,7 @@ function profile(place, sessions) {
     place.hidden = false;
     graph.hidden = !data[0].length;
     if (graph.hidden) return;
-    const lines = measured.map((session, at) => line(at, session.name));
+    const lines = measured.map((session, at) => line(at, nameOf(session.session)));
     const [x, y] = ["u, projector rows from the pixel's own", "light, 1 = white"];
     plot ??= plotIn(graph, { x, y, lines, legend: measured.length > 1 }, data);
     plot.setData(data);
