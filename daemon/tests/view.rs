@@ -225,7 +225,10 @@ fn only_the_page_itself_is_let_in_and_only_with_its_users_rights() {
         fs::set_permissions(&data, fs::Permissions::from_mode(0o750)).unwrap();
         let page = lab.view(Some(OBSERVER));
         let status = page.call("status", json!({}));
-        assert_eq!((&status["result"]["role"], &status["result"]["operators"]), (&json!("observer"), &json!("raysweep")));
+        assert_eq!(
+            (&status["result"]["role"], &status["result"]["operators"]),
+            (&json!("observer"), &json!("raysweep"))
+        );
         for (method, params) in [
             ("run", json!({ "plan": SWEEP })),
             ("resume", json!({ "session": "groove" })),

@@ -4,6 +4,7 @@ use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
+use raysweep_config::Plan;
 use raysweep_session::ledger::PointEntry;
 use raysweep_session::stack::{ArrayName, Contents};
 use raysweep_session::{Session, input, transport};
@@ -12,7 +13,6 @@ use serde_json::{Value, json};
 use super::super::sessions::SessionView;
 use super::super::thumbnails::{about, pictures, small};
 use super::pictures::Encoded;
-use crate::procedure;
 
 /// Largest report, in bytes.
 const MOST_REPORT_BYTES: u64 = 1 << 28;
@@ -31,7 +31,8 @@ pub(super) fn session(folder: &Path) -> Result<Value, String> {
     view["has_transport"] = json!(session.transport_path().exists());
     let plan = input::read(&session.plan_path(), MOST_PLAN_BYTES).map_err(told)?;
     let is_whole = view["state"] == "complete" && view["stored"] == view["points"];
-    view["can_resume"] = json!(!is_whole && procedure::past(&String::from_utf8_lossy(&plan)).is_none());
+    let plan = Plan::parse_stored(&String::from_utf8_lossy(&plan));
+    view["can_resume"] = json!(!is_whole && plan.is_ok_and(|plan| plan.procedure.past().is_none()));
     Ok(view)
 }
 
