@@ -65,6 +65,9 @@ def first_visit(page):
     expect(page.locator("#checked")).to_contain_text("frames")
     shot(page, "check")
     page.click("#start")
+    # A run that is still being prepared would leave no session.
+    page.click("#pause")
+    expect(page.locator("#state")).to_have_text("paused")
     page.click("#cancel")
     expect(page.locator("#notes")).to_contain_text("The run is cancelled.")
     begun = page.locator("#run-name").text_content()
