@@ -7,8 +7,8 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use raysweep_config::{ConfigError, Plan};
 use raysweep_config::plan::with_tables;
+use raysweep_config::{ConfigError, Plan};
 use raysweep_core::{CameraCapabilities, Size, io_text};
 use raysweep_pipeline::message_of;
 use raysweep_processing::calibration::{CalibrationHeader, KeptCalibration, current_in};

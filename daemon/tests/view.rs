@@ -73,7 +73,7 @@ impl Lab {
         command.arg("view").arg("--json").arg("--socket").arg(self.socket());
         command.stdout(Stdio::piped()).stderr(said);
         if let Some(uid) = uid {
-            command.uid(uid);
+            command.uid(uid).gid(uid);
         }
         let (process, output) = Process::with_output(&mut command);
         let mut line = String::new();

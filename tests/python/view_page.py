@@ -110,7 +110,7 @@ def viewfinder(page):
     page.mouse.move(box["x"] + 23.5 * pixel, box["y"] + 27.5 * pixel, steps=4)
     page.mouse.up()
     expect(figures).to_contain_text("rows 4 to 27, columns 8 to 23")
-    expect(page.locator("#row-cut-text")).to_have_text("Along row 16")
+    expect(page.locator("#row-cut-text")).to_have_text("Counts along row 16")
     expect(page.locator("#column-cut .u-wrap")).to_be_visible()
     shots(page, "viewfinder")
     page.click("#finder-whole")
