@@ -36,6 +36,7 @@ def shots(page, name):
             fits(page, name)
             shot(page, f"{name}-{scheme}-{width}")
     page.set_viewport_size(size)
+    page.emulate_media(color_scheme=SCHEMES[0])
 
 
 def fits(page, name):

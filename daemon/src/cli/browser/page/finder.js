@@ -33,11 +33,13 @@ export function startFinder(order) {
 export function marksOf({ name, about }) {
   if (name !== "viewfinder") return {};
   size = about.size;
-  const [top, bottom, left, right] = about.region.map((at) => at / (about.reduced_by ?? 1));
+  const side = about.reduced_by ?? 1;
+  const [top, bottom, left, right] = about.region;
+  const middle = (first, end) => (Math.floor((first + end) / 2) + 0.5) / side;
   const isWhole = about.region.join() === [0, size[0], 0, size[1]].join();
   return {
-    frame: isWhole ? null : [top, bottom, left, right],
-    cross: by("finder-cross").checked ? [(top + bottom) / 2, (left + right) / 2] : null,
+    frame: isWhole ? null : about.region.map((at) => at / side),
+    cross: by("finder-cross").checked ? [middle(top, bottom), middle(left, right)] : null,
   };
 }
 

@@ -263,7 +263,7 @@ function describe({ about, shape }) {
   if (about.points != null) parts.push(`from ${about.points} points`);
   if (about.cycle != null) parts.push(`cycle ${about.cycle}`);
   if (about.batch != null) parts.push(`batch ${about.batch}`);
-  if (about.units) parts.push(about.units);
+  if (about.units) parts.push(about.units.split(";")[0]);
   if (about.session) parts.push(nameOf(about.session));
   return parts.join(" · ");
 }
