@@ -7,8 +7,8 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use raysweep_config::ConfigError;
 use raysweep_config::plan::with_tables;
+use raysweep_config::{ConfigError, Plan};
 use raysweep_core::{CameraCapabilities, Size, io_text};
 use raysweep_pipeline::message_of;
 use raysweep_processing::calibration::{CalibrationHeader, KeptCalibration, current_in};
@@ -28,7 +28,7 @@ use crate::live::{LiveFile, Outlet};
 use crate::mirror;
 use crate::probes::Probes;
 use crate::procedure::lab::Lab;
-use crate::procedure::{Unresumable, foresee, foresee_rest, past};
+use crate::procedure::{Unresumable, foresee, foresee_rest};
 use crate::rig::{AnyRig, RigError, SharedRig};
 use crate::run::board::{StatusBoard, WrongState};
 use crate::run::life::{Foreseen, Run, conduct};
@@ -397,7 +397,7 @@ impl Runner {
         };
         let plan = read(session.plan_path())?;
         // Another rig file would not help.
-        if let Some(what) = past(&plan) {
+        if let Some(what) = Plan::parse_stored(&plan).ok().and_then(|plan| plan.procedure.past()) {
             return Err(no_session(format!("{}: {what}", session.dir().display())));
         }
         if !self.rig.is_of(&read(session.rig_path())?) {

@@ -41,9 +41,13 @@ struct Lab {
 
 impl Lab {
     fn start() -> Self {
+        Self::with(RIG)
+    }
+
+    fn with(rig: &str) -> Self {
         let folder = tempfile::tempdir().unwrap();
         fs::set_permissions(folder.path(), fs::Permissions::from_mode(0o755)).unwrap();
-        fs::write(folder.path().join("rig.toml"), RIG).unwrap();
+        fs::write(folder.path().join("rig.toml"), rig).unwrap();
         let daemon = Process::start(
             Command::new(env!("CARGO_BIN_EXE_raysweepd"))
                 .current_dir(folder.path())
@@ -65,9 +69,11 @@ impl Lab {
 
     fn view(&self, uid: Option<u32>) -> Page {
         let mut command = Command::new(env!("CARGO_BIN_EXE_raysweep"));
-        command.arg("view").arg("--json").arg("--socket").arg(self.socket()).stdout(Stdio::piped());
+        let said = fs::File::create(self.folder.path().join("said")).unwrap();
+        command.arg("view").arg("--json").arg("--socket").arg(self.socket());
+        command.stdout(Stdio::piped()).stderr(said);
         if let Some(uid) = uid {
-            command.uid(uid);
+            command.uid(uid).gid(uid);
         }
         let (process, output) = Process::with_output(&mut command);
         let mut line = String::new();
@@ -76,6 +82,11 @@ impl Lab {
         let address = told["address"].as_str().unwrap().to_owned();
         let (host, path) = address.strip_prefix("http://").unwrap().split_once('/').unwrap();
         Page { _view: process, host: host.into(), path: format!("/{path}"), address: address.clone() }
+    }
+
+    /// What the view last started said on the terminal.
+    fn said(&self) -> String {
+        fs::read_to_string(self.folder.path().join("said")).unwrap()
     }
 
     /// Runs a plan to its end; returns its session.
@@ -119,6 +130,8 @@ impl Page {
         body: &str,
     ) -> (u16, String, Vec<u8>) {
         let mut stream = TcpStream::connect(&self.host).unwrap();
+        // A stream of events that is let in has no end.
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
         let has_host = headers.iter().any(|(name, _)| *name == "Host");
         let mut head =
             format!("{method} {path} HTTP/1.1\r\nConnection: close\r\nContent-Length: {}\r\n", body.len());
@@ -159,6 +172,24 @@ fn only_the_page_itself_is_let_in_and_only_with_its_users_rights() {
     let call = json!({ "method": "status" }).to_string();
     let to_call = format!("{}call", page.path);
     let wrong_token = page.path.replace(|digit: char| digit.is_ascii_hexdigit(), "0");
+    let session = lab.run(SWEEP);
+    let session = format!("session/{}", session.file_name().unwrap().to_str().unwrap());
+    let of_session = ["", "/report", "/thumbnail", "/picture/epipolar", "/pixel/1/1", "/delays/1/1"];
+    let of_session = of_session.map(|rest| format!("{session}{rest}"));
+    let routes = ["events", "live", "live/epipolar"].into_iter().chain(of_session.iter().map(String::as_str));
+    for route in routes {
+        if route != "events" {
+            assert_eq!(page.get(route).0, 200, "{route}");
+        }
+        for (path, headers) in [
+            (&wrong_token, &[][..]),
+            (&page.path, &[("Host", "rig.example.org")]),
+            (&page.path, &[("Origin", "http://example.org")]),
+        ] {
+            let (status, _, body) = page.request("GET", &format!("{path}{route}"), headers, "");
+            assert_eq!(status, 403, "{route} {headers:?}: {}", String::from_utf8_lossy(&body));
+        }
+    }
     for (path, headers) in [
         ("/", &[][..]),
         ("/call", &[]),
@@ -189,12 +220,39 @@ fn only_the_page_itself_is_let_in_and_only_with_its_users_rights() {
 
     // Only root can start a process of another user.
     if Uid::effective().is_root() {
+        // As in the service.
+        let data = lab.folder.path().join("data");
+        fs::set_permissions(&data, fs::Permissions::from_mode(0o750)).unwrap();
         let page = lab.view(Some(OBSERVER));
-        assert_eq!(page.call("status", json!({}))["result"]["role"], "observer");
-        for method in ["run", "pause", "continue", "cancel"] {
-            let params = if method == "run" { json!({ "plan": SWEEP }) } else { json!({}) };
+        let status = page.call("status", json!({}));
+        assert_eq!(
+            (&status["result"]["role"], &status["result"]["operators"]),
+            (&json!("observer"), &json!("raysweep"))
+        );
+        for (method, params) in [
+            ("run", json!({ "plan": SWEEP })),
+            ("resume", json!({ "session": "groove" })),
+            ("pause", json!({})),
+            ("continue", json!({})),
+            ("cancel", json!({})),
+            ("viewfinder", json!({ "picture": "black" })),
+        ] {
             assert_eq!(page.call(method, params)["error"]["data"]["name"], "forbidden", "{method}");
         }
+        let (status, _, names) = page.get("live");
+        let names: Value = serde_json::from_slice(&names).unwrap();
+        assert_eq!((status, names["epipolar"].is_u64()), (200, true), "{names}");
+        assert_eq!(page.get("live/epipolar").0, 200, "observers see live what a run does");
+        let why = format!("only members of the group `root` may read {}", data.display());
+        for route in &of_session {
+            let (status, _, body) = page.get(route);
+            let text = String::from_utf8_lossy(&body).into_owned();
+            assert!(status == 403 && text.starts_with(&why), "{route}: {status} {text}");
+        }
+        let listed = page.call("sessions", json!({}));
+        assert_eq!(listed["result"].as_array().unwrap().len(), 1, "{listed}");
+        assert!(listed["text"].as_str().unwrap().starts_with(&why), "{listed}");
+        assert!(lab.said().contains("you are an observer") && lab.said().contains(&why), "{}", lab.said());
     }
 }
 
@@ -216,10 +274,18 @@ fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     files
 }
 
+/// Number of a live picture.
+fn sequence(picture: &[u8]) -> u64 {
+    let length = u32::from_le_bytes(picture[..4].try_into().unwrap()) as usize;
+    let head: Value = serde_json::from_slice(&picture[4..4 + length]).unwrap();
+    head["sequence"].as_u64().unwrap()
+}
+
 #[test]
 fn ten_browsers_cost_a_sweep_and_a_film_no_frame_and_no_bit() {
     const BROWSERS: usize = 10;
-    let lab = Lab::start();
+    // On virtual time the camera would wait for a daemon that is late.
+    let lab = Lab::with(&format!("{RIG}realtime = true\n"));
     let alone: Vec<PathBuf> = [SWEEP, FILM].map(|plan| lab.run(plan)).into();
     let page = Arc::new(lab.view(None));
     let (stop, pictures) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicUsize::new(0)));
@@ -237,12 +303,17 @@ fn ten_browsers_cost_a_sweep_and_a_film_no_frame_and_no_bit() {
         .map(|browser| {
             let (page, stop, pictures) = (page.clone(), stop.clone(), pictures.clone());
             std::thread::spawn(move || {
+                let (name, mut newest) = (["epipolar", "indirect", "total"][browser % 3], 0);
+                // As fast as the page: each picture once, as soon as it comes.
                 while !stop.load(Ordering::Relaxed) {
-                    let name = ["epipolar", "indirect", "total"][browser % 3];
-                    let (status, _, body) = page.get(&format!("live/{name}"));
-                    pictures
-                        .fetch_add(usize::from(status == 200 && body.len() > 2 * 48 * 32), Ordering::Relaxed);
                     page.call("status", json!({}));
+                    let (status, _, body) = page.get(&format!("live/{name}?after={newest}"));
+                    if status == 200 {
+                        newest = sequence(&body);
+                        pictures.fetch_add(1, Ordering::Relaxed);
+                    } else {
+                        std::thread::sleep(Duration::from_millis(50));
+                    }
                 }
             })
         })
@@ -263,6 +334,8 @@ fn ten_browsers_cost_a_sweep_and_a_film_no_frame_and_no_bit() {
         }
     }
     for ((alone, watched), array) in alone.iter().zip(&watched).zip(["stack.zarr", "film.zarr"]) {
+        let counts = Session::open(watched).unwrap().state().unwrap().counts;
+        assert!(counts.balanced() && counts.lost_total() == 0, "{array}: {counts:?}");
         let (alone, watched) = (files(&alone.join(array)), files(&watched.join(array)));
         assert!(alone.len() > 2 && alone == watched, "{array} differs");
     }
@@ -300,7 +373,8 @@ fn the_light_of_a_pixel_over_the_delays_is_that_of_the_stack() {
     assert_eq!(status, 404);
 }
 
-/// A run is checked, started, watched, paused, finished; its report is opened; two sessions are compared.
+/// A run is checked, started, watched, paused, cancelled, resumed, finished; its report is opened; a viewfinder is worked;
+/// two sessions are compared; a run's questions are answered.
 #[test]
 fn the_page_works_in_a_real_browser() {
     let python = std::env::var("RAYSWEEP_PYTHON").expect(
@@ -308,9 +382,13 @@ fn the_page_works_in_a_real_browser() {
     );
     let lab = Lab::start();
     let page = lab.view(None);
+    let rig = RIG.replace("[projector]\ndriver = \"sim\"", "[projector]\ndriver = \"external\"");
+    assert_ne!(rig, RIG);
+    let asking = Lab::with(&format!("{rig}realtime = true\n"));
+    let asked = asking.view(None);
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/python/view_page.py");
     let mut command = Command::new(python);
-    command.arg(script).arg(&page.address).arg(lab.write_plan(SWEEP));
+    command.arg(script).arg(&page.address).arg(lab.write_plan(SWEEP)).arg(&asked.address);
     // To look at them: RAYSWEEP_SCREENSHOTS=FOLDER.
     if let Some(folder) = std::env::var_os("RAYSWEEP_SCREENSHOTS") {
         command.arg(folder);

@@ -1,23 +1,47 @@
-"""The page of `raysweep view` in Chromium: view_page.py ADDRESS PLAN [FOLDER FOR SCREENSHOTS]"""
+"""The page of `raysweep view` in Chromium: view_page.py ADDRESS PLAN ADDRESS_OF_A_RIG_THAT_ASKS [FOLDER FOR SCREENSHOTS]"""
 
 import sys
 from pathlib import Path
 
 from playwright.sync_api import expect, sync_playwright
 
-address, plan = sys.argv[1], Path(sys.argv[2]).read_text()
-screenshots = Path(sys.argv[3]) if len(sys.argv) > 3 else None
+address, plan, asking = sys.argv[1], Path(sys.argv[2]).read_text(), sys.argv[3]
+screenshots = Path(sys.argv[4]) if len(sys.argv) > 4 else None
 # A busy machine may take its time.
 expect.set_options(timeout=120_000)
 # Long enough that a slow browser can still pause it.
 LONG = plan.replace("average = 4", "average = 400")
 assert LONG != plan
+SHORT = "kind = \"sweep\"\nname = \"asked\"\n[sweep]\ndelay_us = [-300, 0, 300]\nexposure_us = [500]\naverage = 2\n"
+SCHEMES = ["light", "dark"]
+WIDTHS = [1280, 400]
 
 
 def shot(page, name):
     if screenshots:
         screenshots.mkdir(exist_ok=True)
         page.screenshot(path=screenshots / f"{name}.png", full_page=True)
+
+
+def shots(page, name):
+    """The page in both schemes and widths."""
+    if not screenshots:
+        return
+    size = page.viewport_size
+    for scheme in SCHEMES:
+        page.emulate_media(color_scheme=scheme)
+        for width in WIDTHS:
+            page.set_viewport_size({"width": width, "height": 900})
+            page.wait_for_timeout(500)
+            fits(page, name)
+            shot(page, f"{name}-{scheme}-{width}")
+    page.set_viewport_size(size)
+    page.emulate_media(color_scheme=SCHEMES[0])
+
+
+def fits(page, name):
+    width = page.evaluate("document.documentElement.scrollWidth")
+    assert width <= page.viewport_size["width"], f"{name}: {width} pixels wide"
 
 
 def run(page, plan):
@@ -31,7 +55,7 @@ def run(page, plan):
 
 
 def first_visit(page):
-    """Checks, starts, pauses and continues a run, and opens its report."""
+    """Checks, starts, cancels, resumes, pauses and continues a run, and opens its report."""
     page.goto(address)
     expect(page.locator("#state")).to_have_text("idle")
     page.fill("#plan", "kind = \"sweep\"\n[sweep]\naverage = 0")
@@ -42,8 +66,18 @@ def first_visit(page):
     expect(page.locator("#checked")).to_contain_text("frames")
     shot(page, "check")
     page.click("#start")
+    # A run that is still being prepared would leave no session.
     page.click("#pause")
     expect(page.locator("#state")).to_have_text("paused")
+    page.click("#cancel")
+    expect(page.locator("#notes")).to_contain_text("The run is cancelled.")
+    begun = page.locator("#run-name").text_content()
+    page.click("#tab-sessions")
+    page.locator(f"#sessions .choose[title='{begun}']").click()
+    page.get_by_role("button", name="Resume").click()
+    page.click("#pause")
+    expect(page.locator("#state")).to_have_text("paused")
+    expect(page.locator("#run-name")).to_have_text(begun)
     shot(page, "paused")
     page.click("#continue")
     expect(page.locator("#notes")).to_contain_text("The run is complete.")
@@ -59,17 +93,67 @@ def first_visit(page):
 
 
 def viewfinder(page):
-    """Watches the viewfinder, changes what the projector shows, and ends it."""
-    page.fill("#plan", "kind = \"viewfinder\"")
-    page.click("#start")
-    expect(page.locator("#finder-figures")).to_contain_text("of the best")
-    page.get_by_role("button", name="viewfinder", exact=True).click()
+    """Watches a viewfinder, changes what the projector shows, chooses a region, and ends it."""
+    page.click("#find")
+    figures = page.locator("#finder-figures")
+    expect(figures).to_contain_text("of the best")
+    expect(figures).to_contain_text("rows 0 to 47, columns 0 to 31")
     expect(page.locator("#live-about")).to_contain_text("camera counts")
     page.get_by_role("button", name="rows", exact=True).click()
     expect(page.get_by_role("button", name="rows", exact=True)).to_have_attribute("aria-pressed", "true")
-    shot(page, "viewfinder")
+    page.check("#finder-cross")
+    live = page.locator("#live-picture canvas.image")
+    live.scroll_into_view_if_needed()
+    box = live.bounding_box()
+    pixel = box["width"] / 32
+    page.mouse.move(box["x"] + 8.5 * pixel, box["y"] + 4.5 * pixel)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 23.5 * pixel, box["y"] + 27.5 * pixel, steps=4)
+    page.mouse.up()
+    expect(figures).to_contain_text("rows 4 to 27, columns 8 to 23")
+    expect(page.locator("#row-cut-text")).to_have_text("Counts along row 16")
+    expect(page.locator("#column-cut .u-wrap")).to_be_visible()
+    shots(page, "viewfinder")
+    page.click("#finder-whole")
+    expect(figures).to_contain_text("rows 0 to 47, columns 0 to 31")
     page.click("#cancel")
     expect(page.locator("#finder")).to_be_hidden()
+
+
+def questions(page):
+    """Answers what a run with a projector that an operator works asks."""
+    page.goto(asking)
+    page.fill("#plan", SHORT)
+    page.click("#start")
+    for wanted in ["light off", "white"]:
+        expect(page.locator("#question-text")).to_contain_text(wanted)
+        if wanted == "white":
+            shot(page, "question")
+        page.click("#answer")
+    expect(page.locator("#notes")).to_contain_text("The run is complete.")
+    expect(page.locator("#notes")).to_contain_text("the run is over")
+    expect(page.locator("#question")).to_be_hidden()
+
+
+def many_tabs(context):
+    """Tabs that are not seen hold none of the six connections that a browser has to an address."""
+    tabs = [context.new_page() for _ in range(8)]
+    for tab in tabs:
+        tab.goto(address)
+        expect(tab.locator("#state")).to_have_text("idle")
+        tab.evaluate("""() => {
+            Object.defineProperty(document, "hidden", { configurable: true, get: () => true });
+            document.dispatchEvent(new Event("visibilitychange"));
+        }""")
+    # When it is seen again, it hears what happens.
+    first = tabs[0]
+    first.evaluate("""() => {
+        delete document.hidden;
+        document.dispatchEvent(new Event("visibilitychange"));
+    }""")
+    run(first, plan)
+    for tab in tabs:
+        tab.close()
 
 
 def visit(page, name):
@@ -96,15 +180,17 @@ def visit(page, name):
     page.locator("#sessions li", has_text="groove").nth(1).get_by_role("button", name="compare").click()
     expect(page.locator("#session h3").nth(2)).to_contain_text("RMS")
     expect(page.locator("#session canvas.image")).to_have_count(3)
-    width = page.evaluate("document.documentElement.scrollWidth")
-    assert width <= page.viewport_size["width"], f"{name}: {width} pixels wide"
+    page.locator("#session canvas.image").first.focus()
+    page.keyboard.press("ArrowDown")
+    expect(page.locator("#session .u-legend .u-series")).to_have_count(3)
+    fits(page, name)
     shot(page, f"sessions-{name}")
 
 
 with sync_playwright() as playwright:
     browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=["--no-sandbox"])
     complaints = []
-    for turn, (scheme, width) in enumerate([("light", 1280), ("dark", 400)]):
+    for turn, (scheme, width) in enumerate(zip(SCHEMES, WIDTHS)):
         context = browser.new_context(color_scheme=scheme, viewport={"width": width, "height": 900})
         page = context.new_page()
         page.on("console", lambda message: complaints.append(message.text) if message.type in ("error", "warning") else None)
@@ -112,6 +198,8 @@ with sync_playwright() as playwright:
         if turn == 0:
             first_visit(page)
             viewfinder(page)
+            questions(page)
+            many_tabs(context)
         visit(page, f"{scheme}-{width}")
         context.close()
     browser.close()

@@ -102,7 +102,7 @@ fn estimates_appear_while_the_sweep_goes_on_and_come_to_its_result() {
         Probes { stages: vec![Arc::new(patient)], ..Probes::default() }
     });
     assert_eq!(bench.runner.status().live.as_deref(), Some(&*file));
-    assert_eq!(std::fs::metadata(&file).unwrap().permissions().mode() & 0o777, 0o640);
+    assert_eq!(std::fs::metadata(&file).unwrap().permissions().mode() & 0o777, 0o644);
     let mut events = bench.runner.events();
     let ended = bench.run(PLAN);
     assert_eq!(ended.state, "complete", "{:?}", ended.error);

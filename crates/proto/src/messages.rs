@@ -185,6 +185,9 @@ pub struct Status {
     /// What the caller may do.
     #[serde(default)]
     pub role: Option<Role>,
+    /// Group whose members are operators, if one is set.
+    #[serde(default)]
+    pub operators: Option<String>,
     /// What the daemon is doing.
     pub state: RunState,
     /// What the operator has to do before `continue`, if the run waits for that.

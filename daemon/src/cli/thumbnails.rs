@@ -15,10 +15,12 @@ use super::failure::CommandFailure;
 const MOST_PICTURE_BYTES: u64 = (4 << 24) + (1 << 16);
 /// Largest description of a product.
 const MOST_ABOUT_BYTES: u64 = 1 << 24;
+/// Pictures that say most of a session, best first.
+const BEST: [&str; 3] = ["epipolar", "regular", "floodlit"];
 /// The brightest half per cent of the pixels is white.
 const WHITE_PERCENT: f64 = 99.5;
 
-/// Names of the products that are pictures, sorted.
+/// Names of the products that are pictures: those that say most, then the others, sorted.
 pub(super) fn pictures(session: &Session) -> Vec<String> {
     let Ok(entries) = fs::read_dir(session.products_path()) else { return Vec::new() };
     let mut names: Vec<String> = entries
@@ -30,6 +32,7 @@ pub(super) fn pictures(session: &Session) -> Vec<String> {
         .filter_map(|path| Some(path.file_stem()?.to_str()?.to_owned()))
         .collect();
     names.sort();
+    names.sort_by_key(|name| BEST.iter().position(|best| best == name).unwrap_or(BEST.len()));
     names
 }
 
@@ -43,22 +46,30 @@ fn is_picture(about: &Value) -> bool {
     [json!(["t", "s"]), json!(["t", "s", "rgb"])].contains(&about["axes"])
 }
 
-/// Writes a small PNG file of each picture of a session into `folder`, each with its own white; returns their paths.
+/// A picture of a session as a small PNG file, with its own white; `None` if its file holds no picture.
+///
+/// # Errors
+/// If the file cannot be read.
+pub(super) fn small(session: &Session, name: &str) -> raysweep_session::Result<Option<Vec<u8>>> {
+    let image = session.products().read_array(name)?;
+    let image = if image.ndim() == 2 { image.insert_axis(Axis(2)) } else { image };
+    // The dimensions in the file may contradict the names of the axes beside it.
+    let Ok(image) = image.into_dimensionality::<Ix3>() else { return Ok(None) };
+    let planes: Vec<_> = image.axis_iter(Axis(2)).collect();
+    if ![1, 3].contains(&planes.len()) || image.is_empty() {
+        return Ok(None);
+    }
+    let white = ToneMap::percentile(&planes, WHITE_PERCENT);
+    Picture::small(image.view(), white).to_png().map(Some)
+}
+
+/// Writes a small PNG file of each picture of a session into `folder`; returns their paths.
 pub(super) fn write(session: &Path, folder: &Path) -> Result<Vec<PathBuf>, CommandFailure> {
     let session = Session::open(session).map_err(ProcessError::from)?;
     fs::create_dir_all(folder).map_err(|source| CommandFailure::Write { path: folder.to_owned(), source })?;
     let mut written = Vec::new();
     for name in pictures(&session) {
-        let image = session.products().read_array(&name).map_err(ProcessError::from)?;
-        let image = if image.ndim() == 2 { image.insert_axis(Axis(2)) } else { image };
-        // The dimensions in the file may contradict the names of the axes beside it.
-        let Ok(image) = image.into_dimensionality::<Ix3>() else { continue };
-        let planes: Vec<_> = image.axis_iter(Axis(2)).collect();
-        if ![1, 3].contains(&planes.len()) || image.is_empty() {
-            continue;
-        }
-        let white = ToneMap::percentile(&planes, WHITE_PERCENT);
-        let png = Picture::small(image.view(), white).to_png().map_err(ProcessError::from)?;
+        let Some(png) = small(&session, &name).map_err(ProcessError::from)? else { continue };
         let path = folder.join(format!("{name}.png"));
         durable::write(&path, &png).map_err(ProcessError::from)?;
         written.push(path);

@@ -16,8 +16,8 @@ use serde_json::{Map, Value, json};
 
 use super::LiveError;
 
-/// Owner may write, group may read.
-const MODE: u32 = 0o640;
+/// All may read: observers see live what a run does. Sessions are for members of the group.
+const MODE: u32 = 0o644;
 /// Slots of the file: it can hold one name less than this at once.
 const SLOTS: usize = 8;
 /// Pixels per slot; larger images are downsampled.
@@ -67,7 +67,7 @@ impl Slots {
 }
 
 impl LiveFile {
-    /// Creates the file, readable for the owner's group. A file left by a dead daemon is replaced.
+    /// Creates the file, readable for all. A file left by a dead daemon is replaced.
     ///
     /// # Errors
     /// [`LiveError::Taken`], [`LiveError::NotLive`] if something else has this name, [`LiveError::Io`].

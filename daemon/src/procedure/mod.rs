@@ -104,10 +104,13 @@ pub fn foresee_rest(
         (SharedRig::Plane(rig), Procedure::Calibration(own)) => {
             Ok(calibration::foresee(lab, RigOfRun::of_begun(rig, begun), &plan, own)?)
         }
-        (_, Procedure::Film(_)) => Err(Unresumable::Past(FILM_IS_PAST)),
-        (_, Procedure::Batches(_)) => Err(Unresumable::Past(BATCHES_ARE_PAST)),
-        (_, Procedure::Response(_)) => Err(Unresumable::Past(RESPONSE_IS_PAST)),
-        (_, Procedure::Viewfinder(_)) => Err(Unresumable::Past(VIEWFINDER_IS_PAST)),
+        (
+            _,
+            past @ (Procedure::Film(_)
+            | Procedure::Batches(_)
+            | Procedure::Response(_)
+            | Procedure::Viewfinder(_)),
+        ) => Err(Unresumable::Past(past.past().unwrap_or_default())),
         (
             SharedRig::Dots(_),
             Procedure::Sweep(_) | Procedure::Patterns(_) | Procedure::Darks(_) | Procedure::Calibration(_),
@@ -116,25 +119,6 @@ pub fn foresee_rest(
             "a dot rig runs plans of kind \"batches\", \"response\" and \"viewfinder\"",
         )
         .into()),
-    }
-}
-
-const FILM_IS_PAST: &str = "a film cannot be resumed, because it records one moment: `raysweep process` makes the transports of its stored cycles; run the plan again for another film";
-const BATCHES_ARE_PAST: &str = "batches cannot be resumed, because they record one moment: `raysweep process` makes the products of the stored ones; run the plan again for more";
-const RESPONSE_IS_PAST: &str = "a run of kind \"response\" cannot be resumed: run the plan again";
-const VIEWFINDER_IS_PAST: &str =
-    "a viewfinder stores nothing, so there is nothing to resume: start another one";
-
-/// Why no session of this plan can be resumed on any rig.
-pub fn past(text: &str) -> Option<&'static str> {
-    match Plan::parse_stored(text).ok()?.procedure {
-        Procedure::Film(_) => Some(FILM_IS_PAST),
-        Procedure::Batches(_) => Some(BATCHES_ARE_PAST),
-        Procedure::Response(_) => Some(RESPONSE_IS_PAST),
-        Procedure::Viewfinder(_) => Some(VIEWFINDER_IS_PAST),
-        Procedure::Sweep(_) | Procedure::Patterns(_) | Procedure::Darks(_) | Procedure::Calibration(_) => {
-            None
-        }
     }
 }
 

@@ -25,6 +25,7 @@ impl StatusBoard {
     pub fn new(rig: &str) -> Self {
         let status = Status {
             role: None,
+            operators: None,
             version: env!("CARGO_PKG_VERSION").into(),
             rig: rig.into(),
             state: RunState::Idle,

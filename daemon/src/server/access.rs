@@ -64,6 +64,11 @@ impl Access {
         }
     }
 
+    /// The group whose members are operators, if one is set.
+    pub(super) fn operators(&self) -> Option<String> {
+        self.operators.clone()
+    }
+
     /// The error for an observer who calls a method reserved for operators.
     pub(super) fn forbidden(&self, method: Method, peer: Peer) -> RpcError {
         let name = method.name();

@@ -105,8 +105,8 @@ impl Connection {
             false => None,
         };
         let control = self.desk.control.clone();
-        let role = self.role;
-        let call = move || dispatch::carry_out(&*control, method, role, request.params);
+        let caller = dispatch::Caller { role: self.role, operators: self.desk.access.operators() };
+        let call = move || dispatch::carry_out(&*control, method, caller, request.params);
         let reply = tokio::task::spawn_blocking(call).await.map_err(|error| {
             let name = method.name();
             tracing::error!(%error, method = name, "a call failed in the daemon");

@@ -10,6 +10,13 @@ use tokio::sync::broadcast;
 
 use crate::control::Control;
 
+/// Who calls.
+pub(super) struct Caller {
+    pub role: Role,
+    /// The group whose members are operators.
+    pub operators: Option<String>,
+}
+
 /// Result of a call.
 pub(super) struct CallResult {
     /// The method's result.
@@ -30,7 +37,7 @@ pub(super) fn computes(method: Method) -> bool {
 pub(super) fn carry_out(
     control: &dyn Control,
     method: Method,
-    role: Role,
+    caller: Caller,
     given: Map<String, Value>,
 ) -> Result<CallResult, RpcError> {
     let result = match method {
@@ -40,7 +47,11 @@ pub(super) fn carry_out(
         Method::Run => control.run(params::<RunParams>(given)?).and_then(value),
         Method::Resume => control.resume(params::<ResumeParams>(given)?).and_then(value),
         Method::Describe => none(given).and_then(|()| value(describe(env!("CARGO_PKG_VERSION")))),
-        Method::Status => none(given).and_then(|()| value(Status { role: Some(role), ..control.status() })),
+        Method::Status => {
+            none(given)?;
+            let Caller { role, operators } = caller;
+            value(Status { role: Some(role), operators, ..control.status() })
+        }
         Method::Sessions => none(given).and_then(|()| control.sessions()).and_then(value),
         Method::Calibrations => none(given).and_then(|()| control.calibrations()).and_then(value),
         Method::UseCalibration => {

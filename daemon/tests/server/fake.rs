@@ -205,6 +205,7 @@ impl Control for Fake {
         let state = *self.state.lock().unwrap();
         Status {
             role: None,
+            operators: None,
             version: "1".into(),
             rig: "plane".into(),
             state,

@@ -166,6 +166,23 @@ impl Procedure {
         };
         kind.name()
     }
+
+    /// Why no session of it can be resumed, on any rig; `None` if sessions of it can.
+    pub fn past(&self) -> Option<&'static str> {
+        match self {
+            Self::Film(_) => Some(
+                "a film cannot be resumed, because it records one moment: `raysweep process` makes the transports of its stored cycles; run the plan again for another film",
+            ),
+            Self::Batches(_) => Some(
+                "batches cannot be resumed, because they record one moment: `raysweep process` makes the products of the stored ones; run the plan again for more",
+            ),
+            Self::Response(_) => Some("a run of kind \"response\" cannot be resumed: run the plan again"),
+            Self::Viewfinder(_) => {
+                Some("a viewfinder stores nothing, so there is nothing to resume: start another one")
+            }
+            Self::Sweep(_) | Self::Patterns(_) | Self::Darks(_) | Self::Calibration(_) => None,
+        }
+    }
 }
 
 impl Plan {

@@ -4,6 +4,7 @@
 //! it, and reads the live file and the sessions as that user. Nothing here runs in the daemon. Data flow one way, from
 //! the [`hub`] that follows the daemon to any number of browsers; only `call` goes back.
 
+mod barred;
 mod guard;
 mod hub;
 mod pictures;
@@ -22,13 +23,14 @@ use axum::response::sse::{KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
 use axum::{Json, Router, middleware};
-use raysweep_proto::{Client, ClientError, ErrorCode, Method, RpcError};
+use raysweep_proto::{Client, ClientError, ErrorCode, Method, Role, RpcError, Status};
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 use tokio::net::TcpListener;
 use tokio::sync::Semaphore;
 use tokio::task::spawn_blocking;
 
+use self::barred::barred;
 use self::guard::Guard;
 use self::hub::Hub;
 use super::exit::Exit;
@@ -79,6 +81,7 @@ struct View {
 /// Serves the page on 127.0.0.1 until Ctrl-C; prints its address first. Port 0: any free one.
 pub(super) fn view(socket: &Path, port: u16, printer: Printer) -> Result<Exit, CommandFailure> {
     let token = token().map_err(CommandFailure::View)?;
+    warn_observers(socket);
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
     let runtime = runtime.map_err(CommandFailure::View)?;
     let served = runtime.block_on(async {
@@ -106,6 +109,23 @@ pub(super) fn view(socket: &Path, port: u16, printer: Printer) -> Result<Exit, C
     served.map(|()| Exit::Done)
 }
 
+/// Tells observers on the terminal what the page will not show or do.
+fn warn_observers(socket: &Path) {
+    // A daemon that does not listen yet is waited for by the hub.
+    let Ok(mut client) = Client::connect(socket) else { return };
+    let Ok(Status { role: Some(Role::Observer), operators, .. }) = client.status() else { return };
+    eprintln!("you are an observer: you see what the rig does, and cannot operate it");
+    if let Some(group) = operators {
+        eprintln!(
+            "to operate it, have root add you to the group `{group}` (`usermod -aG {group} USER`) and log in again"
+        );
+    }
+    let newest = client.sessions().ok().and_then(|sessions| sessions.into_iter().next_back());
+    if let Some(why) = newest.and_then(|newest| barred(&newest.session)) {
+        eprintln!("you do not see what sessions contain: {why}");
+    }
+}
+
 fn routes(view: Arc<View>, guard: Guard) -> Router {
     let mut pages = Router::new();
     for (name, kind, content) in FILES {
@@ -119,6 +139,7 @@ fn routes(view: Arc<View>, guard: Guard) -> Router {
         .route("/{token}/live/{name}", get(live_picture))
         .route("/{token}/session/{session}", get(session))
         .route("/{token}/session/{session}/report", get(report))
+        .route("/{token}/session/{session}/thumbnail", get(thumbnail))
         .route("/{token}/session/{session}/picture/{product}", get(product))
         .route("/{token}/session/{session}/pixel/{row}/{column}", get(pixel))
         .route("/{token}/session/{session}/delays/{row}/{column}", get(delays))
@@ -143,7 +164,8 @@ struct Call {
     params: Map<String, Value>,
 }
 
-/// Carries out a call of the daemon: `{"result": ...}` or `{"error": {"code": ..., "message": ...}}`.
+/// Carries out a call of the daemon: `{"result": ..., "text": ...}` or `{"error": {"code": ..., "message": ...}}`. The
+/// text is the report of `check`, or why the files of `sessions` may not be read.
 async fn call(State(view): State<Arc<View>>, body: Bytes) -> Response {
     let call: Call = match serde_json::from_slice(&body) {
         Ok(call) => call,
@@ -156,13 +178,18 @@ async fn call(State(view): State<Arc<View>>, body: Bytes) -> Response {
     let socket = view.socket.clone();
     let answer = spawn_blocking(move || {
         let result: Value = Client::connect(&socket)?.call(method, &call.params)?;
-        Ok::<_, ClientError>(result)
+        let text = match method {
+            Method::Check => serde_json::from_value(result.clone()).ok().map(|report| show::check(&report)),
+            Method::Sessions => {
+                let newest = result.as_array().and_then(|sessions| sessions.last()?["session"].as_str());
+                newest.and_then(|session| barred(Path::new(session)))
+            }
+            _ => None,
+        };
+        Ok::<_, ClientError>((result, text))
     });
     match answer.await {
-        Ok(Ok(result)) => {
-            let text = serde_json::from_value(result.clone()).ok().filter(|_| method == Method::Check);
-            Json(json!({ "result": result, "text": text.map(|report| show::check(&report)) })).into_response()
-        }
+        Ok(Ok((result, text))) => Json(json!({ "result": result, "text": text })).into_response(),
         Ok(Err(ClientError::Rpc(error))) => Json(json!({ "error": error })).into_response(),
         Ok(Err(error)) => Json(json!({ "error": { "message": error.to_string() } })).into_response(),
         Err(_) => {
@@ -179,7 +206,11 @@ async fn events(State(view): State<Arc<View>>) -> impl IntoResponse {
 /// Names of the live images, with the sequence number of the newest of each.
 async fn live(State(view): State<Arc<View>>) -> Response {
     let file = view.hub.live_file();
-    read(move || pictures::names(file.as_deref()).map(|names| Json(names).into_response())).await
+    read(move || match file.as_deref().and_then(barred) {
+        Some(why) => Ok(refused(StatusCode::FORBIDDEN, &why)),
+        None => pictures::names(file.as_deref()).map(|names| Json(names).into_response()),
+    })
+    .await
 }
 
 #[derive(Deserialize)]
@@ -215,14 +246,28 @@ async fn session(
     State(view): State<Arc<View>>,
     Segment((_, session)): Segment<(String, String)>,
 ) -> Response {
-    read(move || Ok(Json(stored::session(&view.hub.session(&session)?)?).into_response())).await
+    read_session(view, session, |folder| Ok(Json(stored::session(folder)?).into_response())).await
 }
 
 /// The report, which contains its pictures and no script.
 async fn report(State(view): State<Arc<View>>, Segment((_, session)): Segment<(String, String)>) -> Response {
-    read(move || {
-        let page = stored::report(&view.hub.session(&session)?)?;
+    read_session(view, session, |folder| {
+        let page = stored::report(folder)?;
         Ok(([(header::CONTENT_TYPE, "text/html; charset=utf-8"), guard::OF_REPORTS], page).into_response())
+    })
+    .await
+}
+
+/// A small PNG file; "no content" for a session without pictures.
+async fn thumbnail(
+    State(view): State<Arc<View>>,
+    Segment((_, session)): Segment<(String, String)>,
+) -> Response {
+    read_session(view, session, |folder| {
+        let png = stored::thumbnail(folder)?;
+        Ok(png.map_or(StatusCode::NO_CONTENT.into_response(), |png| {
+            ([(header::CONTENT_TYPE, "image/png")], png).into_response()
+        }))
     })
     .await
 }
@@ -231,7 +276,7 @@ async fn product(
     State(view): State<Arc<View>>,
     Segment((_, session, product)): Segment<(String, String, String)>,
 ) -> Response {
-    read(move || Ok(stored::picture(&view.hub.session(&session)?, &product)?.into_response())).await
+    read_session(view, session, move |folder| Ok(stored::picture(folder, &product)?.into_response())).await
 }
 
 /// Light from each projector row to a pixel.
@@ -239,7 +284,8 @@ async fn pixel(
     State(view): State<Arc<View>>,
     Segment((_, session, row, column)): Segment<(String, String, usize, usize)>,
 ) -> Response {
-    read(move || Ok(Json(stored::pixel(&view.hub.session(&session)?, row, column)?).into_response())).await
+    read_session(view, session, move |folder| Ok(Json(stored::pixel(folder, row, column)?).into_response()))
+        .await
 }
 
 /// Light of a pixel over the delays, from what a sweep has stored so far.
@@ -247,7 +293,24 @@ async fn delays(
     State(view): State<Arc<View>>,
     Segment((_, session, row, column)): Segment<(String, String, usize, usize)>,
 ) -> Response {
-    read(move || Ok(Json(stored::delays(&view.hub.session(&session)?, row, column)?).into_response())).await
+    read_session(view, session, move |folder| Ok(Json(stored::delays(folder, row, column)?).into_response()))
+        .await
+}
+
+/// Reads a session that the daemon lists, if this user may.
+async fn read_session(
+    view: Arc<View>,
+    session: String,
+    reading: impl FnOnce(&Path) -> Result<Response, String> + Send + 'static,
+) -> Response {
+    read(move || {
+        let folder = view.hub.session(&session)?;
+        match barred(&folder) {
+            Some(why) => Ok(refused(StatusCode::FORBIDDEN, &why)),
+            None => reading(&folder),
+        }
+    })
+    .await
 }
 
 /// Reads files without holding up other requests; an error becomes a text.

@@ -4,28 +4,35 @@ use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
+use raysweep_config::Plan;
 use raysweep_session::ledger::PointEntry;
 use raysweep_session::stack::{ArrayName, Contents};
-use raysweep_session::{Session, transport};
+use raysweep_session::{Session, input, transport};
 use serde_json::{Value, json};
 
 use super::super::sessions::SessionView;
-use super::super::thumbnails::{about, pictures};
+use super::super::thumbnails::{about, pictures, small};
 use super::pictures::Encoded;
 
 /// Largest report, in bytes.
 const MOST_REPORT_BYTES: u64 = 1 << 28;
+/// Largest plan, in bytes.
+const MOST_PLAN_BYTES: u64 = 1 << 20;
 
 fn told(error: impl std::fmt::Display) -> String {
     error.to_string()
 }
 
-/// A session as `raysweep show --json` shows it, with the names of the products that are pictures.
+/// A session as `raysweep show --json` shows it, with the names of the products that are pictures, the best first.
 pub(super) fn session(folder: &Path) -> Result<Value, String> {
     let mut view = serde_json::to_value(SessionView::read(folder).map_err(told)?).map_err(told)?;
     let session = Session::open(folder).map_err(told)?;
     view["images"] = json!(pictures(&session));
     view["has_transport"] = json!(session.transport_path().exists());
+    let plan = input::read(&session.plan_path(), MOST_PLAN_BYTES).map_err(told)?;
+    let is_whole = view["state"] == "complete" && view["stored"] == view["points"];
+    let plan = Plan::parse_stored(&String::from_utf8_lossy(&plan));
+    view["can_resume"] = json!(!is_whole && plan.is_ok_and(|plan| plan.procedure.past().is_none()));
     Ok(view)
 }
 
@@ -51,12 +58,21 @@ pub(super) fn picture(folder: &Path, product: &str) -> Result<Encoded, String> {
     Ok(Encoded::new(image.view(), json!({ "name": product, "about": about })))
 }
 
+/// The picture that says most of a session, as a small PNG file, if it has any.
+pub(super) fn thumbnail(folder: &Path) -> Result<Option<Vec<u8>>, String> {
+    let session = Session::open(folder).map_err(told)?;
+    let best = pictures(&session).into_iter().next();
+    best.map_or(Ok(None), |name| small(&session, &name)).map_err(told)
+}
+
 /// Light from each relative projector row u to a pixel, with the first u.
 pub(super) fn pixel(folder: &Path, row: usize, column: usize) -> Result<Value, String> {
-    let session = Session::open(folder).map_err(told)?;
-    let profiles = transport::read_profiles(&session.transport_path(), &[[row, column]]).map_err(told)?;
-    let about = about(&session.products_path().join("transport.npy"));
-    Ok(json!({ "u_min": about["u_min"], "light": profiles.first().map(|light| light.to_vec()) }))
+    let path = Session::open(folder).map_err(told)?.transport_path();
+    let (_, attributes) = transport::describe(&path).map_err(told)?;
+    let u_min = attributes.get("u_min").and_then(Value::as_i64);
+    let u_min = u_min.ok_or("the transport does not say its u_min; `raysweep process` makes it again")?;
+    let profiles = transport::read_profiles(&path, &[[row, column]]).map_err(told)?;
+    Ok(json!({ "u_min": u_min, "light": profiles.first().map(|light| light.to_vec()) }))
 }
 
 /// Light of a pixel over the delays of a sweep, from what is stored so far: `{delay_us: [...], exposures: [{exposure_us,

@@ -21,11 +21,11 @@ fn show(live: &LiveFile, name: &str, image: &ArrayD<f32>) -> u64 {
 }
 
 #[test]
-fn an_image_reads_back_from_a_file_of_fixed_size_for_the_group_that_is_removed_at_the_end() {
+fn an_image_reads_back_from_a_file_of_fixed_size_for_all_that_is_removed_at_the_end() {
     let (_folder, path) = folder();
     let live = LiveFile::create(&path).unwrap();
     let bytes = fs::metadata(&path).unwrap().len();
-    assert_eq!(fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o640);
+    assert_eq!(fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o644);
     let reader = LiveReader::open(&path).unwrap();
     assert_eq!(reader.newest("epipolar").unwrap(), None);
     let image = Array3::from_shape_fn((2, 3, 5), |(k, t, s)| (k * 100 + t * 10 + s) as f32).into_dyn();

@@ -216,6 +216,7 @@ impl Finder {
             ("session", json!(session)),
             ("picture", json!(self.values.picture)),
             ("region", json!(self.values.region)),
+            ("size", json!(pixels.shape())),
             ("pictures", json!(self.values.pictures)),
             ("exposure_us", json!(self.values.exposure_us)),
             ("black_dn", json!(self.scale.black_dn)),

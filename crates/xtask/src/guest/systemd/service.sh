@@ -36,6 +36,8 @@ systemctl restart raysweepd.service
 
 sweep() { code 0 as ada raysweep run /share/plan.toml </dev/null && is_complete && bits >/share/bits; }
 check "an operator's sweep over the socket completes" sweep
+live() { code 0 as eve raysweep preview --output /home/eve/live.png && ! as eve ls $DATA; }
+check "any other user sees the live images, and no session" live
 
 devices() {
     # Plugged in after the daemon was started.

@@ -42,17 +42,22 @@ views.forEach((view, index) => {
   });
 });
 
+/** Hears the daemon's events while the page can be seen: browsers allow an address six connections, over all tabs. */
 function follow(listeners) {
-  const events = new EventSource("events");
-  events.onmessage = (message) => {
-    if (!message.data) return;
-    const event = JSON.parse(message.data);
-    for (const listener of listeners) listener(event);
+  let events = null;
+  const tell = (event) => { for (const listener of listeners) listener(event); };
+  const open = () => {
+    events = new EventSource("events");
+    events.onmessage = (message) => { if (message.data) tell(JSON.parse(message.data)); };
+    events.onerror = () => tell({ event: "connection", lost: "`raysweep view` does not answer" });
   };
-  events.onerror = () => {
-    for (const listener of listeners) listener({ event: "connection", lost: "`raysweep view` does not answer" });
+  const look = () => {
+    events?.close();
+    if (!document.hidden) open();
   };
+  document.addEventListener("visibilitychange", look);
+  look();
 }
 
-follow([startRun(), startSessions({ open: () => choose("sessions") })]);
+follow([startRun(), startSessions({ watch: () => choose("run") })]);
 choose("run");

@@ -36,8 +36,8 @@ export function decode(buffer) {
 }
 
 /** The picture at an address; null if there is none (yet). */
-export async function fetchPicture(address) {
-  const answer = await fetch(address);
+export async function fetchPicture(address, signal) {
+  const answer = await fetch(address, { signal });
   if (answer.status === 204) return null;
   if (!answer.ok) throw new Error(await answer.text());
   return decode(await answer.arrayBuffer());
@@ -57,7 +57,8 @@ export const number = (value) =>
   !Number.isFinite(value) ? "–" : value === 0 ? "0" : Math.abs(value) >= 1e5 || Math.abs(value) < 1e-3
     ? value.toExponential(2) : String(Number(value.toPrecision(4)));
 
-const element = (name, attributes = {}, ...children) => {
+/** Makes an element; attributes `on...` are listeners. */
+export const element = (name, attributes = {}, ...children) => {
   const made = document.createElement(name);
   for (const [key, value] of Object.entries(attributes)) {
     if (key.startsWith("on")) made.addEventListener(key.slice(2), value);
@@ -66,7 +67,6 @@ const element = (name, attributes = {}, ...children) => {
   made.append(...children.filter((child) => child != null));
   return made;
 };
-export { element };
 
 /** Draws values into a canvas of one pixel each. */
 export function paint(canvas, picture, colours, low, high) {
@@ -95,33 +95,56 @@ export function paint(canvas, picture, colours, low, high) {
   context.putImageData(image, 0, 0);
 }
 
-/** A picture with its tools, in `place`. `onpixel(row, column)` is called for the pixel under the cursor. */
+/**
+ * A picture with its tools, in `place`. `onpixel(row, column)` is called for the pixel under the cursor, and, while
+ * `selects` is set, `onregion([top, bottom, left, right])` for pixels over which the pointer is dragged. `marks` may
+ * have a `frame` around such a region, and a `cross` at a row and column.
+ */
 export class Picture {
-  constructor(place, { label, colours = "grey", onpixel = () => {}, symmetric = false }) {
+  constructor(place, { label, colours = "grey", onpixel = () => {}, onregion = () => {}, symmetric = false }) {
     this.colours = colours;
     this.symmetric = symmetric;
     this.onpixel = onpixel;
+    this.onregion = onregion;
+    this.selects = false;
+    this.marks = {};
+    /** Where a drag began, while it lasts. */
+    this.grabbed = null;
     this.zoom = { factor: 1, x: 0, y: 0 };
     this.canvas = element("canvas", { class: "image", role: "img", "aria-label": label, tabindex: "0" });
     this.whole = document.createElement("canvas");
-    this.choice = element("select", { "aria-label": "Colours", onchange: () => { this.colours = this.choice.value; this.draw(); } },
+    const redraw = (change) => () => {
+      change();
+      this.draw();
+    };
+    this.choice = element("select",
+      { "aria-label": "Colours", onchange: redraw(() => { this.colours = this.choice.value; }) },
       ...Object.keys(ANCHORS).map((name) => element("option", { value: name, selected: name === colours }, name)));
-    const limit = (name) => element("input", { type: "number", step: "any", "aria-label": name, onchange: () => { this.auto.checked = false; this.draw(); } });
+    const limit = (name) => element("input", { type: "number", step: "any", "aria-label": name,
+      onchange: redraw(() => { this.auto.checked = false; }) });
     [this.low, this.high] = [limit("Lower limit"), limit("Upper limit")];
     this.auto = element("input", { type: "checkbox", checked: true, onchange: () => this.draw() });
     this.bar = element("canvas", { width: "256", height: "1", "aria-hidden": "true" });
     [this.from, this.to] = [element("span"), element("span")];
     this.readout = element("p", { class: "readout" });
-    const reset = element("button", { type: "button", onclick: () => { this.zoom = { factor: 1, x: 0, y: 0 }; this.draw(); } }, "Whole picture");
+    const reset = element("button",
+      { type: "button", onclick: redraw(() => { this.zoom = { factor: 1, x: 0, y: 0 }; }) }, "Whole picture");
     this.element = element("div", { class: "picture" },
       element("div", { class: "stage" }, this.canvas),
       element("div", { class: "scale" }, this.from, this.bar, this.to),
       this.readout,
-      element("div", { class: "tools" }, element("label", {}, "Colours ", this.choice), element("label", {}, this.auto, " automatic limits"),
+      element("div", { class: "tools" }, element("label", {}, "Colours ", this.choice),
+        element("label", {}, this.auto, " automatic limits"),
         this.low, "to", this.high, reset));
     place.append(this.element);
     this.canvas.addEventListener("pointermove", (event) => this.point(event));
-    this.canvas.addEventListener("wheel", (event) => { event.preventDefault(); this.magnify(event); }, { passive: false });
+    this.canvas.addEventListener("pointerdown", (event) => this.grab(event));
+    this.canvas.addEventListener("pointerup", () => this.release());
+    this.canvas.addEventListener("pointercancel", () => { this.grabbed = null; });
+    this.canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      this.magnify(event);
+    }, { passive: false });
     this.canvas.addEventListener("keydown", (event) => this.step(event));
   }
 
@@ -131,13 +154,19 @@ export class Picture {
     if (this.at) this.tell();
   }
 
+  mark(marks) {
+    this.marks = marks;
+    this.draw();
+  }
+
   draw() {
     if (!this.picture) return;
     if (this.auto.checked) {
       let [low, high] = quantiles(this.picture.values, [0.005, 0.995]);
       if (this.symmetric) { high = Math.max(Math.abs(low), Math.abs(high)) || 1; low = -high; }
       else low = Math.min(low, 0);
-      [this.low.value, this.high.value] = [Number(low.toPrecision(3)), Number((high > low ? high : low + 1).toPrecision(3))];
+      if (high <= low) high = low + 1;
+      [this.low.value, this.high.value] = [low, high].map((limit) => Number(limit.toPrecision(3)));
     }
     const [low, high] = [Number(this.low.value), Number(this.high.value)];
     paint(this.whole, this.picture, this.colours, low, high);
@@ -150,9 +179,36 @@ export class Picture {
     const context = this.canvas.getContext("2d");
     context.imageSmoothingEnabled = false;
     context.drawImage(this.whole, x, y, columns / factor, rows / factor, 0, 0, this.canvas.width, this.canvas.height);
+    this.drawMarks(context);
     const bar = { shape: [1, 256], values: Float32Array.from({ length: 256 }, (_, step) => step) };
     paint(this.bar, bar, this.colours, 0, 255);
     [this.from.textContent, this.to.textContent] = [number(low), number(high)];
+  }
+
+  drawMarks(context) {
+    const { factor, x, y } = this.zoom;
+    const scale = (factor * this.canvas.width) / this.picture.shape[1];
+    const [across, down] = [(column) => (column - x) * scale, (row) => (row - y) * scale];
+    const path = new Path2D();
+    const frame = this.dragged ?? this.marks.frame;
+    if (frame) {
+      const [top, bottom, left, right] = frame;
+      path.rect(across(left), down(top), (right - left) * scale, (bottom - top) * scale);
+    }
+    if (this.marks.cross) {
+      const [row, column] = this.marks.cross;
+      path.moveTo(0, down(row));
+      path.lineTo(this.canvas.width, down(row));
+      path.moveTo(across(column), 0);
+      path.lineTo(across(column), this.canvas.height);
+    }
+    // Seen on dark and on bright pixels alike.
+    const width = this.canvas.width / (this.canvas.clientWidth || this.canvas.width);
+    for (const [colour, wide] of [["#000000", 3], ["#ffd54a", 1]]) {
+      context.strokeStyle = colour;
+      context.lineWidth = wide * width;
+      context.stroke(path);
+    }
   }
 
   /** Pixel under the pointer. */
@@ -167,8 +223,43 @@ export class Picture {
     return [y + down / factor, x + across / factor];
   }
 
+  /** Pixels between two places, at least one. */
+  region([row, column], [otherRow, otherColumn]) {
+    const [rows, columns] = this.picture.shape;
+    const within = (at, other, length) => {
+      const first = Math.min(Math.max(Math.floor(Math.min(at, other)), 0), length - 1);
+      return [first, Math.max(Math.min(Math.ceil(Math.max(at, other)), length), first + 1)];
+    };
+    return [...within(row, otherRow, rows), ...within(column, otherColumn, columns)];
+  }
+
+  /** The region dragged over so far; null if it is too small to be meant. */
+  get dragged() {
+    if (!this.grabbed?.to) return null;
+    const [top, bottom, left, right] = this.region(this.grabbed.from, this.grabbed.to);
+    return bottom - top > 2 && right - left > 2 ? [top, bottom, left, right] : null;
+  }
+
+  grab(event) {
+    if (!this.picture || !this.selects || event.button !== 0) return;
+    this.canvas.setPointerCapture(event.pointerId);
+    this.grabbed = { from: this.place(event), to: null };
+  }
+
+  release() {
+    const region = this.dragged;
+    this.grabbed = null;
+    if (!region) return;
+    this.onregion(region);
+    this.draw();
+  }
+
   point(event) {
     if (!this.picture) return;
+    if (this.grabbed) {
+      this.grabbed.to = this.place(event);
+      this.draw();
+    }
     const [row, column] = this.place(event).map(Math.floor);
     const [rows, columns] = this.picture.shape;
     if (row < 0 || column < 0 || row >= rows || column >= columns) return;

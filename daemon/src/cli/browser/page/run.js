@@ -1,9 +1,9 @@
 // The view of the run: state, figures, question, VSYNC, plan and live pictures.
 
 import { by, call, note } from "./main.js";
-import { hearFinder, showFinder, startFinder } from "./finder.js";
+import { marksOf, showFinder, startFinder } from "./finder.js";
 import { startDelays } from "./delays.js";
-import { axisColour, gridColour } from "./plots.js";
+import { line, plotIn } from "./plots.js";
 import { Picture, element, fetchPicture, number } from "./picture.js";
 
 const UNDER_WAY = ["preparing", "armed", "running", "paused", "draining"];
@@ -18,17 +18,21 @@ const words = (name) => name.replaceAll("_", " ");
 const nameOf = (folder) => folder?.split("/").pop();
 
 let status = {};
+/** What was last asked; at the end of a run nothing waits for it. */
+let asked = null;
+/** Why the last order was refused, until the next one. */
+let complaint = null;
 /** Jitter since the page was opened: seconds, standard deviation, 99th percentile. */
 const jitter = [[], [], []];
-let plot = null;
+let jitterPlot = null;
 const opened = performance.now();
 
 export function startRun() {
-  for (const [id, method] of [["pause", "pause"], ["continue", "continue"], ["answer", "continue"], ["cancel", "cancel"]]) {
-    by(id).addEventListener("click", async () => {
+  const buttons = [["pause", "pause"], ["continue", "continue"], ["answer", "continue"], ["cancel", "cancel"]];
+  for (const [id, method] of buttons) {
+    by(id).addEventListener("click", () => {
       by(id).disabled = true;
-      complain(await call(method));
-      refresh();
+      order(method);
     });
   }
   by("plan-file").addEventListener("change", async (event) => {
@@ -36,10 +40,9 @@ export function startRun() {
     if (file) by("plan").value = await file.text();
   });
   by("check").addEventListener("click", check);
-  by("start").addEventListener("click", start);
-  window.addEventListener("resize", () => plot?.setSize({ width: by("vsync").clientWidth, height: 150 }));
-  startFinder({ complain, refresh });
-  watchPictures();
+  by("start").addEventListener("click", () => start(by("plan").value));
+  by("find").addEventListener("click", () => start("kind = \"viewfinder\"\n"));
+  watchPictures(startFinder(order));
   setInterval(() => { if (!document.hidden) refresh(); }, 2000);
   return hear;
 }
@@ -53,9 +56,14 @@ function hear(event) {
       break;
     case "progress": status.progress = event; draw(); break;
     case "vsync": addJitter(event); break;
-    case "viewfinder": hearFinder(event); break;
-    case "state": status.state = event.state; draw(); refresh(); break;
-    case "ask": status.question = event.text; draw(); refresh(); break;
+    case "viewfinder": showFinder(event); break;
+    case "state":
+      status.state = event.state;
+      if (["preparing", "running"].includes(event.state)) asked = null;
+      draw();
+      refresh();
+      break;
+    case "ask": asked = event.text; refresh(); break;
     case "finished": refresh(); break;
   }
 }
@@ -69,20 +77,27 @@ async function refresh() {
   draw();
 }
 
-function complain({ error }) {
-  if (error) by("notes").replaceChildren(note("bad", error.message));
+/** Calls a method that changes the run, and says why if it is refused. */
+async function order(method, params) {
+  const { error } = await call(method, params);
+  complaint = error?.message ?? null;
+  draw();
+  refresh();
 }
 
 function draw() {
-  const { state, progress, session, question, role } = status;
+  const { state, progress, session, question, role, operators } = status;
   const isUnderWay = UNDER_WAY.includes(state);
-  const observes = role === "observer";
   by("daemon").textContent = status.rig ? `${status.rig} rig` : "";
   by("state").textContent = state ? words(state) : "not connected";
   by("state").dataset.state = state ?? "lost";
-  document.title = isUnderWay && progress ? `${progress.points_stored}/${progress.points_planned} – raysweep` : "raysweep";
-  for (const part of document.querySelectorAll(".operator")) part.hidden = observes;
-  by("observer").hidden = !observes;
+  const done = isUnderWay && progress ? `${progress.points_stored}/${progress.points_planned} – ` : "";
+  document.title = `${done}raysweep`;
+  document.body.classList.toggle("observes", role === "observer");
+  document.body.classList.toggle("under-way", isUnderWay);
+  by("observer-text").textContent = operators
+    ? `To operate it, have root add you to the group ${operators}: usermod -aG ${operators} USER. Then log in again.`
+    : "Only root and the daemon's own user operate it.";
   by("question").hidden = !question;
   by("question-text").textContent = question ?? "";
   by("answer").disabled = !question;
@@ -90,7 +105,10 @@ function draw() {
   by("pause").disabled = !["armed", "running"].includes(state);
   by("continue").disabled = state !== "paused";
   by("cancel").disabled = !isUnderWay;
-  by("start").disabled = by("check").disabled = isUnderWay || !state;
+  for (const id of ["start", "check", "find"]) by(id).disabled = isUnderWay || !state;
+  // A viewfinder stores nothing.
+  const stores = Boolean(progress?.points_planned);
+  by("progress").hidden = !stores;
   by("progress").max = progress?.points_planned || 1;
   const point = progress?.under_way;
   by("progress").value = (progress?.points_stored ?? 0) + (point ? point.frames / point.of : 0);
@@ -101,16 +119,23 @@ function draw() {
     if (isUnderWay && point) rows.push(["this point", `frame ${point.frames} of ${point.of}`]);
     if (isUnderWay) rows.push(["time left", clock(progress.left_s ?? NaN)]);
     rows.push(["elapsed", clock(progress.elapsed_s)], ["rate", `${number(progress.frames_per_s)} frames/s`],
-      ["frames used", `${progress.counts.averaged} of ${progress.counts.expected}`], ["lost", lost.join(", ") || "none"]);
+      ["frames used", `${progress.counts.averaged} of ${progress.counts.expected}`],
+      ["lost", lost.join(", ") || "none"]);
   }
-  if (status.mirror) rows.push(["mirror", `${status.mirror.parked ? "parked" : "not parked"}, laser ${status.mirror.laser ? "on" : "off"}`]);
-  by("figures").replaceChildren(...rows.flatMap(([key, value]) => [element("dt", {}, key), element("dd", {}, value)]));
-  const notes = [];
+  if (status.mirror) {
+    const { parked, laser } = status.mirror;
+    rows.push(["mirror", `${parked ? "parked" : "not parked"}, laser ${laser ? "on" : "off"}`]);
+  }
+  by("figures").replaceChildren(
+    ...rows.flatMap(([key, value]) => [element("dt", {}, key), element("dd", {}, value)]));
+  const notes = complaint ? [note("bad", complaint)] : [];
   if (status.ended) notes.push(note(status.ended === "complete" ? "good" : "warn", `The run is ${status.ended}.`));
   if (status.error) notes.push(note("bad", status.error));
+  if (status.ended && asked) notes.push(note("warn", asked));
   notes.push(...(status.warnings ?? []).map((warning) => note("warn", warning)));
-  if (status.ended && session) {
-    notes.push(element("p", {}, element("a", { href: `session/${encodeURIComponent(nameOf(session))}/report`, target: "_blank", rel: "noopener" }, "Open the report")));
+  if (status.ended && session && stores) {
+    const href = `session/${encodeURIComponent(nameOf(session))}/report`;
+    notes.push(element("p", {}, element("a", { href, target: "_blank", rel: "noopener" }, "Open the report")));
   }
   by("notes").replaceChildren(...notes);
 }
@@ -126,15 +151,11 @@ function addJitter(vsync) {
   const row = [(performance.now() - opened) / 1000, vsync.jitter_us, vsync.jitter_p99_us];
   row.forEach((value, axis) => jitter[axis].push(value));
   if (jitter[0].length > 3600) jitter.forEach((values) => values.shift());
-  plot ??= new uPlot({
-    width: by("vsync").clientWidth, height: 150, scales: { x: { time: false } }, legend: { show: false },
-    axes: [{ label: "time since the page was opened, s", labelSize: 20, stroke: axisColour, grid: { stroke: gridColour } },
-      { label: "µs", labelSize: 18, size: 44, stroke: axisColour, grid: { stroke: gridColour } }],
-    series: [{}, { label: "standard deviation", stroke: axisColour, width: 2, points: { show: true, size: 4 } },
-      { label: "99 %", stroke: axisColour, width: 1, dash: [4, 3], points: { show: false } }],
-  }, jitter, by("vsync"));
-  plot.setData(jitter);
+  const lines = [line(0, "standard deviation", { points: { show: true, size: 4 } }), line(1, "99 %", { dash: [4, 3] })];
+  jitterPlot ??= plotIn(by("vsync"), { x: "time since the page was opened, s", y: "µs", lines, height: 150 }, jitter);
+  jitterPlot.setData(jitter);
 }
+
 async function check() {
   by("checked").hidden = false;
   by("checked").className = "checked";
@@ -146,30 +167,65 @@ async function check() {
 
 const mistakes = (error) => (error.data?.mistakes ?? []).map((mistake) => mistake.message).join("\n") || error.message;
 
-async function start() {
-  by("start").disabled = true;
-  const { error } = await call("run", { plan: by("plan").value });
+async function start(plan) {
+  for (const id of ["start", "find"]) by(id).disabled = true;
+  const { error } = await call("run", { plan });
   by("checked").hidden = !error;
   by("checked").className = "checked bad";
   by("checked").textContent = error ? mistakes(error) : "";
+  complaint = null;
   refresh();
 }
 
+const isSeen = () => !document.hidden && !by("view-run").hidden;
+const CHANGES = ["visibilitychange", "shown"];
+
+/** Waits until the live picture can be seen. */
+const seen = () => new Promise((done) => {
+  const look = () => {
+    if (!isSeen()) return;
+    for (const change of CHANGES) document.removeEventListener(change, look);
+    done();
+  };
+  for (const change of CHANGES) document.addEventListener(change, look);
+  look();
+});
+
 /** Shows the newest live picture of the chosen name, as soon as it comes. */
-async function watchPictures() {
+async function watchPictures({ onregion, onmarks }) {
   let [names, chosen, sequence, shown] = [{}, null, 0, null];
+  // A request that waits for a picture takes one of the browser's few connections.
+  let waiting = new AbortController();
+  for (const change of CHANGES) {
+    document.addEventListener(change, () => {
+      if (isSeen()) return;
+      waiting.abort();
+      waiting = new AbortController();
+    });
+  }
   const delays = startDelays();
-  const onpixel = (row, column) => delays(nameOf(shown), row, column);
-  const picture = new Picture(by("live-picture"), { label: "Live picture", onpixel });
+  // A viewfinder has no delays.
+  const onpixel = (row, column) =>
+    delays(shown?.name === "viewfinder" ? null : nameOf(shown?.about.session), row, column);
+  const picture = new Picture(by("live-picture"), {
+    label: "Live picture",
+    onpixel,
+    onregion: (region) => { if (shown?.name === "viewfinder") onregion(region, shown); },
+  });
   picture.element.hidden = true;
+  onmarks(() => { if (shown) picture.mark(marksOf(shown)); });
   const wait = (seconds) => new Promise((done) => { setTimeout(done, 1000 * seconds); });
   const choose = (name) => {
     [chosen, sequence] = [name, 0];
-    for (const button of by("live-names").children) button.setAttribute("aria-pressed", String(button.textContent === name));
+    for (const button of by("live-names").children) {
+      button.setAttribute("aria-pressed", String(button.textContent === name));
+    }
   };
   const look = async () => {
     const answer = await fetch("live");
     const found = answer.ok ? await answer.json() : {};
+    by("live-none").textContent = answer.ok
+      ? "No live picture yet. A run publishes its first after some points." : await answer.text();
     if (Object.keys(found).join() === Object.keys(names).join()) return;
     names = found;
     by("live-names").replaceChildren(...Object.keys(names).map((name) =>
@@ -179,19 +235,22 @@ async function watchPictures() {
   };
   for (;;) {
     try {
+      await seen();
       await look();
-      const newest = chosen && !document.hidden ? await fetchPicture(`live/${encodeURIComponent(chosen)}?after=${sequence}`) : null;
+      const address = `live/${encodeURIComponent(chosen)}?after=${sequence}`;
+      const newest = chosen && await fetchPicture(address, waiting.signal);
       if (newest && newest.name === chosen) {
-        sequence = newest.sequence;
+        [sequence, shown] = [newest.sequence, newest];
         picture.element.hidden = false;
         by("live-none").hidden = true;
+        picture.selects = newest.name === "viewfinder" && status.role === "operator";
+        picture.marks = marksOf(newest);
         picture.show(newest);
         // What the run has stored since belongs to the plot too.
-        shown = newest.about.session;
         if (picture.at) onpixel(...picture.at);
         by("live-about").textContent = describe(newest);
       } else if (!newest) {
-        await wait(chosen && !document.hidden ? 0.05 : 1);
+        await wait(chosen ? 0.05 : 1);
       }
     } catch {
       await wait(1);
@@ -204,7 +263,7 @@ function describe({ about, shape }) {
   if (about.points != null) parts.push(`from ${about.points} points`);
   if (about.cycle != null) parts.push(`cycle ${about.cycle}`);
   if (about.batch != null) parts.push(`batch ${about.batch}`);
-  if (about.units) parts.push(about.units);
+  if (about.units) parts.push(about.units.split(";")[0]);
   if (about.session) parts.push(nameOf(about.session));
   return parts.join(" · ");
 }
