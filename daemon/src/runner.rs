@@ -86,11 +86,11 @@ impl Runner {
     /// each run opens them again, and between runs they are free for other programs.
     ///
     /// # Errors
-    /// The first device that cannot be opened.
+    /// The devices that cannot be opened and that every run needs.
     pub fn new(rig: impl Into<AnyRig>, data: PathBuf) -> Result<Self, RigError> {
         let rig = SharedRig::from(rig.into());
         let (camera, kind) = match &rig {
-            SharedRig::Plane(rig) => (rig.open()?.camera.capabilities().clone(), "plane"),
+            SharedRig::Plane(rig) => (rig.look_for_camera()?, "plane"),
             SharedRig::Dots(rig) => {
                 (rig.open(&data, LEAST_FRAME_RATE_HZ)?.camera.capabilities().clone(), "dots")
             }
@@ -448,7 +448,8 @@ impl Control for Runner {
             SharedRig::Plane(_) => mirror::light_guard(&self.data, None),
             SharedRig::Dots(rig) => rig.light_guard(&self.data),
         };
-        Status { mirror: mirror::status(&self.data, &guard), ..self.board.status() }
+        let mirror = mirror::status(&self.data, &guard);
+        Status { data: Some(self.data.clone()), mirror, ..self.board.status() }
     }
 
     fn check(&self, plan: &str) -> Result<CheckReport, RpcError> {
@@ -516,7 +517,8 @@ impl Control for Runner {
             SharedRig::Dots(rig) => rig.file.mirror.is_none(),
         };
         if is_without_mirror {
-            let what = "this rig has no mirror: there is no light to permit";
+            let what =
+                "this rig has no mirror: there is no light to permit; a projector's needs no permission";
             return Err(RpcError::new(ErrorCode::MethodNotFound, what));
         }
         mirror::arm_light(&self.data)

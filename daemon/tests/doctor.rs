@@ -131,6 +131,66 @@ fn a_jittering_line_is_named() {
     assert_eq!(check(&report, "vsync edges").grade, Grade::Warning, "{report:#?}");
 }
 
+/// A simulated rig whose watcher of the VSYNC is not plugged in.
+const WITHOUT_WATCHER: &str = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver = \"modemline\"\n\
+    modemline.port = \"/dev/serial/by-id/none\"\n[projector]\ndriver = \"sim\"\n\
+    [sim]\nrealtime = true\nscene_rows = 32\nscene_columns = 32\n";
+
+#[test]
+fn raysweepd_checks_every_device_though_one_fails() {
+    let folder = tempfile::tempdir().unwrap();
+    let rig = folder.path().join("rig.toml");
+    let checked = |text: &str| {
+        fs::write(&rig, text).unwrap();
+        let mut command = Command::new(env!("CARGO_BIN_EXE_raysweepd"));
+        command.arg("--check").arg("--rig").arg(&rig).arg("--data").arg(folder.path().join("data"));
+        let output = command.output().unwrap();
+        (output.status.code(), String::from_utf8(output.stdout).unwrap())
+    };
+    let (code, said) = checked(WITHOUT_WATCHER);
+    let line = |name: &str| {
+        let is_of = |line: &&str| line.split_whitespace().nth(1) == Some(name);
+        said.lines().find(is_of).unwrap_or_else(|| panic!("{name}: {said}"))
+    };
+    assert_eq!(code, Some(1), "{said}");
+    assert!(
+        line("vsync").starts_with("FAILURE") && line("vsync").contains("/dev/serial/by-id/none"),
+        "{said}"
+    );
+    for name in ["camera", "projector"] {
+        assert!(line(name).starts_with("OK"), "{said}");
+    }
+    assert!(line("versions").contains("libaravis 0.8.") && line("versions").contains("Linux"), "{said}");
+    // The failure of its file and that of its device are the only ones.
+    assert_eq!(said.lines().filter(|line| line.starts_with("FAILURE")).count(), 2, "{said}");
+    let sound = WITHOUT_WATCHER.replace("modemline\"\nmodemline.port = \"/dev/serial/by-id/none\"", "sim\"");
+    assert_eq!(checked(&sound).0, Some(0));
+}
+
+#[test]
+fn a_plan_is_examined_without_a_daemon_if_the_devices_open() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    fs::write(path("plan.toml"), "kind = \"sweep\"\n[sweep]\ndelay_us = [0, 100]\nexposure_us = [400]\n")
+        .unwrap();
+    let disk = |rig: &str| {
+        fs::write(path("rig.toml"), rig).unwrap();
+        let mut command = Command::new(env!("CARGO_BIN_EXE_raysweep"));
+        command.args(["--json", "doctor", "plan.toml", "--rig", "rig.toml", "--data", "data"]);
+        let output = command.current_dir(&folder).output().unwrap();
+        let said = String::from_utf8(output.stderr).unwrap();
+        let report: DoctorReport = serde_json::from_slice(&output.stdout).expect(&said);
+        (check(&report, "disk").found.clone(), said)
+    };
+    let sound = WITHOUT_WATCHER.replace("modemline\"\nmodemline.port = \"/dev/serial/by-id/none\"", "sim\"");
+    assert!(disk(&sound).0.contains("the plan needs"), "{:?}", disk(&sound));
+    let (found, said) = disk(&sound.replace(
+        "\"sim\"\n[vsync]",
+        "\"v4l2\"\nv4l2 = { device = \"/none\", width = 8, height = 8 }\n[vsync]",
+    ));
+    assert!(!found.contains("the plan needs") && said.contains("plan.toml: not examined"), "{found}: {said}");
+}
+
 /// What is found on a simulated rig without a wire.
 fn simulated(text: &str) -> DoctorReport {
     let folder = tempfile::tempdir().unwrap();

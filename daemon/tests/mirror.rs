@@ -402,3 +402,21 @@ fn viewfinder() {
     assert!(daemon.wait().success(), "{}", lab.log());
     lab.assert_noted();
 }
+
+#[test]
+fn parking_what_was_never_moved_is_a_failure_unless_only_what_was_moved_is_to_be_parked() {
+    let folder = tempfile::tempdir().unwrap();
+    let park = |more: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_raysweep"));
+        let output = command
+            .current_dir(&folder)
+            .args(["park", "--state", "mirror.json"])
+            .args(more)
+            .output()
+            .unwrap();
+        (output.status.code(), String::from_utf8(output.stdout).unwrap())
+    };
+    let (code, said) = park(&[]);
+    assert!(code == Some(1) && said.contains("mirror.json does not exist: nothing was parked"), "{said}");
+    assert_eq!(park(&["--if-moved"]), (Some(0), String::new()));
+}

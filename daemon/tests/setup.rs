@@ -31,6 +31,14 @@ fn setup(folder: &Path, answers: &str) -> Output {
     command.current_dir(folder).stdin(Stdio::null()).output().unwrap()
 }
 
+/// The same, over what is there.
+fn forced(folder: &Path, answers: &str) -> Output {
+    fs::write(folder.join("answers.toml"), answers).unwrap();
+    let mut command = Command::new(env!("CARGO_BIN_EXE_raysweep"));
+    command.args(["--json", "setup", "--answers", "answers.toml", "--rig", "new-rig.toml", "--force"]);
+    command.current_dir(folder).stdin(Stdio::null()).output().unwrap()
+}
+
 fn written(output: &Output) -> Value {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     serde_json::from_slice(&output.stdout).unwrap()
@@ -61,7 +69,12 @@ fn a_rig_set_up_from_answers_is_sound_and_runs_the_papers_sweep() {
     let answers = "kind = 'plane'\nprojector_rows = 64\nrow_time_us = 22.22\nfirst_row_us = 2200\ncamera = 'genicam:127.0.0.1'\n\
         trigger_latency_us = 8\nprojector = 'bench'\nvsync = 'bench'\nscene_rows = 64\n";
     let output = setup(&folder, answers);
-    assert_eq!(written(&output)["rig"], "new-rig.toml");
+    let value = written(&output);
+    assert_eq!(value["rig"], "new-rig.toml");
+    let facts = &value["connected"]["cameras"][0]["facts"];
+    assert_eq!(facts["formats"][0][1][0], serde_json::json!([64, 64]), "{value}");
+    let limits = ["exposure_us", "trigger_delay_us", "rate_hz"].map(|key| &facts[key]["end"]);
+    assert!(limits.iter().all(|most| most.as_f64() > Some(1000.0)), "{value}");
     let text = fs::read_to_string(rig.path("new-rig.toml")).unwrap();
     assert!(
         text.contains("pixel_format = \"Mono12p\"") && text.contains("trigger_source = \"Line0\""),
@@ -109,6 +122,15 @@ fn ports_that_may_be_asked_say_what_they_are_and_a_dot_rig_is_found_sound() {
     let report = examined(folder.path());
     assert!(failures(&report).is_empty(), "{report:#?}");
     assert!(report.checks.iter().any(|check| check.name == "mirror" && check.found.contains("not moved")));
+    let text = fs::read_to_string(folder.path().join("new-rig.toml")).unwrap();
+    assert!(text.contains("max_tilt = 6.5") && text.contains("max_slew_deg_per_s = 8168.14"), "{text}");
+    let answers = format!("{answers}max_tilt = 3\nbandwidth_hz = 400\nmax_step = 0.2\n");
+    written(&forced(folder.path(), &answers));
+    let text = fs::read_to_string(folder.path().join("new-rig.toml")).unwrap();
+    for limit in ["max_tilt = 3.0", "bandwidth_hz = 400.0", "max_step = 0.2", "out_of_band = 0.03"] {
+        assert!(text.contains(limit), "{limit}: {text}");
+    }
+    assert!(failures(&examined(folder.path())).is_empty());
     let held = mirror.truth().held;
     assert!(
         held.iter().all(|held| held.x == 0.0 && held.y == 0.0 && held.light == 0),

@@ -217,9 +217,39 @@ fn what_keeps_it_from_showing_more_is_said() {
 
     let mut view = View::new(&PLANE.replace("[sim.board]", "[sim.vsync]\nmissing = 1.0\n[sim.board]"), "");
     let waits = view.picture(|values| values.problem.is_some());
-    assert!(waits.problem.unwrap().contains("the camera gets no trigger"));
+    let problem = waits.problem.unwrap();
+    assert!(
+        problem.contains("gets no trigger") && problem.contains("viewfinder --trigger none"),
+        "{problem}"
+    );
     view.runner.cancel().unwrap();
     assert_eq!(view.end().0, "complete");
+}
+
+#[test]
+fn a_camera_that_runs_freely_needs_neither_an_edge_nor_a_watcher() {
+    let without_edges = PLANE.replace("[sim.board]", "[sim.vsync]\nmissing = 1.0\n[sim.board]");
+    let without_watcher = PLANE
+        .replace(
+            "[vsync]\ndriver = \"sim\"",
+            "[vsync]\ndriver = \"modemline\"\nmodemline.port = \"/nowhere\"",
+        )
+        .replace("[sim]\n", "[sim]\nrealtime = true\n");
+    for rig in [without_edges, without_watcher] {
+        let mut view = View::new(&rig, "trigger = \"none\"\nsubject = \"board\"\n");
+        // An exposure of a whole period sees all light of each row, wherever it begins: no row is darker than another.
+        let values = view.picture(|values| values.pictures == 3);
+        assert!((values.mean_dn / 2564.0 - 1.0).abs() < 0.02, "{}", values.mean_dn);
+        assert!(values.column_cut.iter().all(|dn| (2000.0..3200.0).contains(dn)), "{:?}", values.column_cut);
+        assert_eq!(values.problem, None);
+        view.show(FinderPicture::Align);
+        let problem = view.picture(|values| values.problem.is_some()).problem.unwrap();
+        assert!(problem.contains("needs trigger = \"vsync\""), "{problem}");
+        view.show(FinderPicture::White);
+        view.picture(|values| values.picture == FinderPicture::White && values.problem.is_none());
+        view.runner.cancel().unwrap();
+        assert_eq!(view.end(), ("complete".into(), None));
+    }
 }
 
 /// Where the mean focus score of pictures at these positions is largest, by a parabola through the best and its
@@ -418,6 +448,14 @@ fn a_scene_that_saturates_in_every_exposure_needs_less_light() {
         said.contains("even in the plan's shortest exposure, 600 us") && said.contains("close the aperture"),
         "{said}"
     );
+}
+
+#[test]
+fn a_plane_rig_has_no_light_to_permit() {
+    let program = Program::start(PLANE);
+    let refused = program.raysweep(&["arm-light"]);
+    let said = String::from_utf8(refused.stderr).unwrap();
+    assert!(refused.status.code() == Some(5) && said.contains("this rig has no mirror"), "{said}");
 }
 
 #[test]

@@ -42,6 +42,8 @@ pub struct FoundAnalyser {
     pub about: String,
     /// Whether it has its firmware.
     pub has_firmware: bool,
+    /// Its node.
+    pub path: PathBuf,
 }
 
 /// A pulse-per-second source of the kernel.
@@ -109,7 +111,8 @@ pub fn analysers() -> Vec<FoundAnalyser> {
         let has_firmware = fx2lafw::has_firmware(device.vendor_id(), device.product_id())?;
         let name = device.product_string().unwrap_or("logic analyser");
         let about = format!("USB {:04x}:{:04x} {name}", device.vendor_id(), device.product_id());
-        Some(FoundAnalyser { about, has_firmware })
+        let path = format!("/dev/bus/usb/{:03}/{:03}", device.busnum(), device.device_address());
+        Some(FoundAnalyser { about, has_firmware, path: path.into() })
     });
     found.collect()
 }

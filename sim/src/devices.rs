@@ -6,11 +6,11 @@ use std::time::Duration;
 use raysweep_core::{
     Applied, Camera, CameraCapabilities, CameraSettings, Clock, ClockHandle, DeviceError, DeviceErrorKind,
     DeviceState, Edge, FirstFrame, FrameBuf, FrameStamp, Pattern, Projector, SettingsId, Shown, Subject,
-    Vsync, us_from_ns,
+    Vsync, ns_from_us, us_from_ns,
 };
 
 use crate::error::SimError;
-use crate::line::{Exposure, Light, LineTruth, VsyncLine};
+use crate::line::{Exposure, Light, LineTruth, TriggeredBy, VsyncLine};
 use crate::sensor::SensorExposure;
 use crate::subject::{SubjectSwitch, not_there};
 use crate::world::PlaneWorld;
@@ -29,6 +29,14 @@ pub struct PlaneDevices {
     pub clock: Clock,
     /// Ground truth of the line, for tests only; real rigs have none.
     pub truth: TruthProbe,
+}
+
+impl PlaneDevices {
+    /// Lets the camera run freely, at this rate, instead of by the edges of the line.
+    pub fn free_run(&self, rate_hz: f64) {
+        let triggered_by = TriggeredBy::FreeRun { period_ns: ns_from_us(1e6 / rate_hz) };
+        self.truth.0.lock().set_triggered_by(self.clock.now_ns(), triggered_by);
+    }
 }
 
 /// Access to the ground truth behind the devices, for tests only.

@@ -21,7 +21,11 @@ const FILM: &str = "kind = \"film\"\n[film]\ncycles = 5\n";
 
 /// A diffuse scene with some indirect light, under a light of this strength.
 fn write_scene(path: &Path, light: f32) {
-    let scene = Array3::from_shape_fn((ROWS, ROWS, COLUMNS), |(v, t, s)| {
+    write_scene_of(path, ROWS, COLUMNS, light);
+}
+
+fn write_scene_of(path: &Path, rows: usize, columns: usize, light: f32) {
+    let scene = Array3::from_shape_fn((rows, rows, columns), |(v, t, s)| {
         light * if v == t { 0.3 + 0.02 * s as f32 } else { 0.01 }
     });
     let mut npz = NpzWriter::new(File::create(path).unwrap());
@@ -70,6 +74,33 @@ fn a_sweep_with_a_covered_lens_is_faulted_before_its_first_point_and_resumes_wit
     // The same bits as those of a run that was never covered.
     let whole = bench.run(SWEEP);
     assert_eq!(sums(&resumed), sums(&whole));
+}
+
+#[test]
+fn a_covered_lens_is_noticed_within_a_second_of_frames_before_any_image() {
+    const SIDE: usize = 96;
+    let folder = tempfile::tempdir().unwrap();
+    let scene = folder.path().join("scene.npz");
+    write_scene_of(&scene, SIDE, SIDE, 0.0);
+    let mut bench = Bench::new(&rig_text(720, &format!("scene = {scene:?}\nseed = 4"), ""));
+    let paper = include_str!("../../deploy/plans/paper.toml");
+    for plan in ["kind = \"patterns\"\n", paper] {
+        let covered = bench.run(plan);
+        let error = covered.error.clone().unwrap_or_default();
+        assert!(covered.state == "faulted" && error.contains("sees no light"), "{error}");
+        let (_, state) = covered.open();
+        let edges = state.end.as_ref().unwrap().vsync.unwrap().edges;
+        println!("faulted after {edges} periods");
+        assert!(edges <= 60, "{edges} periods of 1/60 s");
+        assert_eq!(state.stored(ArrayName::Dark).count(), 0, "it looks before it takes dark images");
+        assert!(state.counts.balanced(), "{:?}", state.counts);
+        if plan == paper {
+            write_scene_of(&scene, SIDE, SIDE, 1.0);
+            bench.restart_with(raysweep::Probes::default());
+            let resumed = bench.resume(&covered.session);
+            assert_eq!((resumed.state.as_str(), &resumed.error), ("complete", &None));
+        }
+    }
 }
 
 #[test]

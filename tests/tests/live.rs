@@ -199,6 +199,10 @@ fn numpy_reads_the_live_file_as_documented_also_while_it_is_written() {
     };
     publish(EPIPOLAR, 3, [4, 6]);
     publish("race", 0, [1, 1]);
+    let early =
+        Command::new(&python).args(["-c", example]).args([file.to_str().unwrap(), "later"]).output().unwrap();
+    let said = String::from_utf8(early.stderr).unwrap();
+    assert!(early.status.code() == Some(1) && said.starts_with("no image 'later' yet"), "{said}");
     let child = Command::new(python)
         .args(["-c", &format!("{example}{RACE}")])
         .args([file.to_str().unwrap(), EPIPOLAR])

@@ -50,6 +50,11 @@ impl SeenLight {
         (LEAST_SIGMAS * self.error_dn).max(LEAST_SHARE * self.white_dn)
     }
 
+    /// Whether there is certainly too little light, which no averaging over more frames would show to be enough.
+    pub fn is_surely_none(&self) -> bool {
+        self.mean_dn + LEAST_SIGMAS * self.error_dn < LEAST_SHARE * self.white_dn
+    }
+
     /// Whether there is light.
     pub fn is_light(&self) -> bool {
         self.mean_dn > self.least_dn()
@@ -106,6 +111,15 @@ mod tests {
         let mut object = dark(2);
         object.slice_mut(ndarray::s![60..66, 60..66]).mapv_inplace(|dn| dn + 60.0);
         assert!(seen(&object).is_light(), "{}", seen(&object));
+    }
+
+    #[test]
+    fn what_few_frames_cannot_tell_from_darkness_is_left_open() {
+        // A white pixel gives 200 counts: 0.04 are needed, and the error of one frame is 0.02 to 0.03.
+        let of = |mean_dn, error_dn| SeenLight { mean_dn, error_dn, white_dn: 200.0 };
+        assert!(of(0.0, 0.005).is_surely_none() && of(-40.0, 0.02).is_surely_none());
+        assert!(!of(0.0, 0.02).is_surely_none() && !of(0.0, 0.02).is_light(), "it may be either");
+        assert!(!of(0.05, 0.0).is_surely_none() && of(0.05, 0.0).is_light());
     }
 
     #[test]

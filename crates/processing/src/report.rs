@@ -57,7 +57,8 @@ pub(crate) fn accounts(state: &State) -> Vec<Block> {
         ));
     }
     if let Some(end) = &state.end {
-        let light = end.light_s.map(|s| ("first to last frame with light", format!("{s:.2} s")));
+        let clock = if end.simulated_time { " (simulated time)" } else { "" };
+        let light = end.light_s.map(|s| ("first to last frame with light", format!("{s:.2} s{clock}")));
         let latency = end.settings_latency.map(|SettingsLatency { min_frames, max_frames }| {
             (
                 "camera settings act",

@@ -193,6 +193,9 @@ pub struct Status {
     /// What the operator has to do before `continue`, if the run waits for that.
     #[serde(default)]
     pub question: Option<String>,
+    /// The folder of its sessions.
+    #[serde(default)]
+    pub data: Option<PathBuf>,
     /// The session of the current or the last run.
     pub session: Option<PathBuf>,
     /// Progress of that run.
@@ -451,6 +454,9 @@ pub enum Event {
         /// points.
         #[serde(default)]
         light_s: Option<f64>,
+        /// Whether `light_s` is time of a simulated rig, which does not wait for the clock on the wall.
+        #[serde(default)]
+        simulated_time: bool,
     },
     /// Events were dropped because the subscriber read too slowly.
     Skipped {

@@ -111,6 +111,7 @@ fn acquire(
         vsync: None,
         final_s: None,
         light_s: None,
+        simulated_time: false,
         settings_latency: None,
     }))?;
     Ok(session)

@@ -34,7 +34,7 @@ pub mod transport;
 mod zarr;
 
 pub use error::{Error, Result};
-pub use folder::{Listing, Session, SessionSummary, list};
+pub use folder::{Listing, Session, SessionSummary, TRASH, list};
 
 /// Camera rows per strip: the unit in which [`stack`] and [`transport`] are stored, and so the cheapest unit
 /// for reading and writing data that do not fit in memory.

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use bytesize::ByteSize;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use clap::{Parser, Subcommand};
+use raysweep_config::plan::FinderTrigger;
 use raysweep_core::FinderPicture;
 use raysweep_processing::ExportFormat;
 
@@ -67,7 +68,6 @@ pub enum Command {
     /// what is wrong. Moves no mirror and turns no light on
     Doctor {
         /// A plan, whose needs the disk is examined for
-        #[arg(conflicts_with = "rig")]
         plan: Option<PathBuf>,
         /// Examine the rig of this rig file, without a daemon and as the user who asks
         #[arg(long, value_name = "FILE")]
@@ -223,7 +223,7 @@ pub enum Command {
     },
     /// Move a session back from the folder .trash
     Restore {
-        /// The session's folder in .trash
+        /// The session's folder in .trash, or its name within the .trash of the daemon's data folder
         session: PathBuf,
     },
     /// Make a session's products and report again from its stored data; needs no daemon, unless the session is given by
@@ -388,10 +388,13 @@ pub struct ViewfinderArguments {
     /// What the projector shows; on a dot rig all but `black` are the dot [default: white]
     #[arg(long, value_parser = picture_parser())]
     pub picture: Option<FinderPicture>,
+    /// What begins each frame of a plane rig: `none` lets the camera run freely, before the VSYNC is wired [default: vsync]
+    #[arg(long, value_parser = trigger_parser())]
+    pub trigger: Option<FinderTrigger>,
     /// Region of the focus score and the other figures: first row, row after the last, first column, column after the last
     #[arg(long, value_name = "T0,T1,S0,S1", value_parser = region)]
     pub region: Option<[usize; 4]>,
-    /// Exposure of each frame in microseconds [default: 0.9 of the time from frame to frame]
+    /// Exposure of each frame in microseconds [default: 0.9 of the projector's period, or all of it without a trigger]
     #[arg(long, value_name = "US")]
     pub exposure_us: Option<f64>,
     /// Have the white board put before the camera first, as for aligning
@@ -401,7 +404,7 @@ pub struct ViewfinderArguments {
     #[arg(long, value_name = "S")]
     pub seconds: Option<f64>,
     /// Start it with this plan of kind "viewfinder" instead
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["picture", "region", "exposure_us", "board", "seconds"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["picture", "trigger", "region", "exposure_us", "board", "seconds"])]
     pub plan: Option<PathBuf>,
     #[command(flatten)]
     pub about: RunDescription,
@@ -422,6 +425,13 @@ fn format_parser() -> impl TypedValueParser<Value = ExportFormat> {
 fn picture_parser() -> impl TypedValueParser<Value = FinderPicture> {
     PossibleValuesParser::new(FinderPicture::ALL.map(FinderPicture::name)).map(|name| {
         let named = FinderPicture::ALL.into_iter().find(|picture| picture.name() == name);
+        named.unwrap_or_default()
+    })
+}
+
+fn trigger_parser() -> impl TypedValueParser<Value = FinderTrigger> {
+    PossibleValuesParser::new(FinderTrigger::ALL.map(FinderTrigger::name)).map(|name| {
+        let named = FinderTrigger::ALL.into_iter().find(|trigger| trigger.name() == name);
         named.unwrap_or_default()
     })
 }

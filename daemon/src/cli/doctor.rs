@@ -2,14 +2,16 @@
 
 use std::path::Path;
 
-use raysweep_proto::{Client, DoctorCheck, DoctorParams, DoctorReport, Grade};
+use raysweep_proto::{Client, ClientError, DoctorCheck, DoctorParams, DoctorReport, Grade};
 
 use super::exit::Exit;
 use super::failure::CommandFailure;
 use super::plan_file::read_plan;
 use super::printer::Printer;
+use crate::control::Control;
 use crate::doctor::examine;
 use crate::rig::AnyRig;
+use crate::runner::Runner;
 
 /// Has the daemon examine its rig.
 pub(super) fn by_daemon(
@@ -20,17 +22,43 @@ pub(super) fn by_daemon(
     let text = plan.map(read_plan).transpose()?;
     let mut client = Client::connect(socket)?;
     let examined = client.doctor(&DoctorParams { plan: text.clone() });
-    let report = examined.map_err(|error| match (plan, &text) {
-        (Some(path), Some(text)) => CommandFailure::of_plan(error, path, text),
-        _ => error.into(),
-    })?;
+    print(&examined.map_err(|error| of_plan(error, plan, text.as_deref()))?, printer)
+}
+
+/// Examines the rig of a rig file. A plan's needs depend on the camera, so they are known only if the devices open.
+pub(super) fn by_hand(
+    rig: &Path,
+    plan: Option<&Path>,
+    data: &Path,
+    printer: Printer,
+) -> Result<Exit, CommandFailure> {
+    let text = plan.map(read_plan).transpose()?;
+    let without_plan =
+        || -> Result<_, CommandFailure> { Ok(examine(&AnyRig::load(rig)?.into(), data, None, &|| true)) };
+    let opened = match plan {
+        Some(plan) => Runner::new(AnyRig::load(rig)?, data.to_owned()).inspect_err(|_| {
+            eprintln!(
+                "{}: not examined, because its needs depend on devices that cannot be opened",
+                plan.display()
+            );
+        }),
+        None => return print(&without_plan()?, printer),
+    };
+    let report = match opened {
+        Ok(runner) => {
+            let examined = runner.doctor(&DoctorParams { plan: text.clone() }).map_err(ClientError::Rpc);
+            examined.map_err(|error| of_plan(error, plan, text.as_deref()))?
+        }
+        Err(_) => without_plan()?,
+    };
     print(&report, printer)
 }
 
-/// Examines the rig of a rig file.
-pub(super) fn by_hand(rig: &Path, data: &Path, printer: Printer) -> Result<Exit, CommandFailure> {
-    let rig = AnyRig::load(rig)?;
-    print(&examine(&rig.into(), data, None, &|| true), printer)
+fn of_plan(error: ClientError, plan: Option<&Path>, text: Option<&str>) -> CommandFailure {
+    match plan.zip(text) {
+        Some((path, text)) => CommandFailure::of_plan(error, path, text),
+        None => error.into(),
+    }
 }
 
 fn print(report: &DoctorReport, printer: Printer) -> Result<Exit, CommandFailure> {

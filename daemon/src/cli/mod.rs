@@ -50,9 +50,9 @@ use self::viewfinder::{Wanted, change_or_plan, changed};
 use raysweep_processing::{
     Asked, ExportFormat, ExportScope, ProcessError, copy_acquired, export, export_as, process_asked,
 };
-use raysweep_session::Session;
 use raysweep_session::integrity::Audit;
 use raysweep_session::ledger::Remark;
+use raysweep_session::{Session, TRASH};
 
 /// Where the packaged daemon listens.
 const DEFAULT_SOCKET: &str = "/run/raysweep/raysweepd.sock";
@@ -83,7 +83,9 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
         Command::Doctor { plan, rig: None, .. } => {
             return doctor::by_daemon(&socket, plan.as_deref(), printer);
         }
-        Command::Doctor { rig: Some(rig), data, .. } => return doctor::by_hand(&rig, &data, printer),
+        Command::Doctor { plan, rig: Some(rig), data } => {
+            return doctor::by_hand(&rig, plan.as_deref(), &data, printer);
+        }
         Command::Camera(command) => return devices::camera(command, printer),
         Command::Check { plan } => {
             let text = read_plan(&plan)?;
@@ -172,9 +174,9 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
                 mirror::park(&state)?
             };
             match parked {
-                // Exit code 0, because a service also parks after runs of a rig without a mirror.
                 Parked::Already if !is_there && !when_closed => {
                     printer.print(&show::nothing_parked_name(), |_| show::nothing_parked(&state))?;
+                    return Ok(Exit::Failed);
                 }
                 parked => printer.print(&show::parked_name(parked), |_| show::parked(parked))?,
             }
@@ -229,8 +231,8 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             }
         }
         Command::Restore { session } => {
-            let to =
-                Session::open(&session).and_then(|session| session.restore()).map_err(ProcessError::from)?;
+            let trashed = Session::open(&trashed_folder_of(session, &socket));
+            let to = trashed.and_then(|session| session.restore()).map_err(ProcessError::from)?;
             printer.print(&json!({ "moved_to": to }), |_| format!("moved to {}", to.display()))?;
         }
         Command::Process { session, to, products, only, memory, accept_damage, accept_edits } => {
@@ -238,10 +240,15 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             if let Some(to) = &to {
                 copy_acquired(&session, to)?;
             }
-            let session = to.unwrap_or(session);
+            let session = to.clone().unwrap_or(session);
             let memory_limit_bytes = memory.map(|size| size.as_u64());
             let asked = Asked { products, only, memory_limit_bytes, accept_damage, accept_edits };
-            let made = process_asked(&session, &asked)?;
+            let made = process_asked(&session, &asked).inspect_err(|_| {
+                // It was made for this, and the next try may want its name.
+                if let Some(made) = &to {
+                    let _ = fs::remove_dir_all(made);
+                }
+            })?;
             let value = json!({
                 "report": made.report, "stored": made.stored, "points": made.points, "problems": made.problems,
             });
@@ -353,6 +360,16 @@ fn folder_of(given: PathBuf, socket: &Path) -> PathBuf {
     let listed = Client::connect(socket).and_then(|mut client| client.sessions()).unwrap_or_default();
     let named = listed.into_iter().find(|info| info.session.file_name() == Some(given.as_os_str()));
     named.map_or(given, |info| info.session)
+}
+
+/// The folder of a session in the trash, which is given by its folder, or by its name if the daemon answers.
+fn trashed_folder_of(given: PathBuf, socket: &Path) -> PathBuf {
+    if given.exists() || given.components().count() != 1 {
+        return given;
+    }
+    let data =
+        Client::connect(socket).and_then(|mut client| client.status()).ok().and_then(|status| status.data);
+    data.map_or(given.clone(), |data| data.join(TRASH).join(given))
 }
 
 const STACK_WITH_FORMAT: &str =

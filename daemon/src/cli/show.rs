@@ -327,12 +327,14 @@ pub(super) struct Ending<'a> {
     pub missing: usize,
     pub final_s: Option<f64>,
     pub light_s: Option<f64>,
+    pub simulated_time: bool,
 }
 
 impl Ending<'_> {
     /// Text for the end of a run.
     pub(super) fn text(&self) -> String {
-        let Self { session, state, report, stored, missing, final_s, light_s } = *self;
+        let Self { session, state, report, stored, missing, final_s, light_s, simulated_time } = *self;
+        let clock = if simulated_time { " (simulated time)" } else { "" };
         let mut lines = vec![match stored + missing {
             // A viewfinder stores nothing.
             0 => state.to_owned(),
@@ -340,7 +342,8 @@ impl Ending<'_> {
         }];
         lines.push(format!("session: {}", session.display()));
         lines.extend(
-            light_s.map(|seconds| format!("{seconds:.2} s from the first to the last frame with light")),
+            light_s
+                .map(|seconds| format!("{seconds:.2} s from the first to the last frame with light{clock}")),
         );
         lines.extend(final_s.map(|seconds| format!("transport on disk {seconds:.2} s after the last frame")));
         lines.extend(report.map(|report| format!("report: {}", report.display())));
@@ -476,6 +479,7 @@ mod tests {
             missing: 35,
             final_s: None,
             light_s: None,
+            simulated_time: false,
         };
         let report = folder.join("report.html");
         let complete = Ending {
@@ -487,11 +491,14 @@ mod tests {
             light_s: Some(10.5),
             ..unfinished
         };
+        let simulated = Ending { simulated_time: true, ..complete }.text();
         let (unfinished, complete) = (unfinished.text(), complete.text());
         assert!(unfinished.contains("35 missing") && unfinished.contains("resume 20260101-000000_corner"));
         assert!(
             complete.contains("0.25 s after the last frame") && complete.contains("10.50 s from the first")
         );
+        assert!(!complete.contains("simulated"));
+        assert!(simulated.contains("10.50 s from the first to the last frame with light (simulated time)"));
         assert!(complete.ends_with("report.html") && !complete.contains("resume"), "{complete}");
     }
 }

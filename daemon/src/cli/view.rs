@@ -97,6 +97,7 @@ impl EventView {
                 found,
                 final_s,
                 light_s,
+                simulated_time,
             } => {
                 self.clear();
                 if let Some(error) = error {
@@ -112,8 +113,9 @@ impl EventView {
                     Some(film) => show::film_ending(session, state, report.as_deref(), film),
                     None => {
                         let (report, stored, missing) = (report.as_deref(), *stored, *missing);
-                        let (final_s, light_s) = (*final_s, *light_s);
-                        Ending { session, state, report, stored, missing, final_s, light_s }.text()
+                        let (final_s, light_s, simulated_time) = (*final_s, *light_s, *simulated_time);
+                        Ending { session, state, report, stored, missing, final_s, light_s, simulated_time }
+                            .text()
                     }
                 };
                 writeln!(io::stdout(), "{summary}")?;
@@ -188,7 +190,8 @@ impl EventView {
                 let parts = progress.under_way.map_or(0.0, PointUnderWay::share) * PARTS;
                 bar.set_length(progress.points_planned as u64 * PARTS as u64);
                 bar.set_position(progress.points_stored as u64 * PARTS as u64 + parts as u64);
-                bar.set_message(format!("{stored}  {pace}"));
+                // Unlike in what is said of the points at the run's end.
+                bar.set_message(format!("{stored} with darks  {pace}"));
                 details.set_message(all);
             }
             Place::Lines { told } if told.is_none_or(|told| told.elapsed() >= PACE) => {

@@ -15,11 +15,12 @@ impl ViewfinderArguments {
     fn plan(&self) -> String {
         let mut plan = "kind = \"viewfinder\"\n[viewfinder]\n".to_owned();
         let picture = self.picture.map(|picture| format!("picture = \"{}\"\n", picture.name()));
+        let trigger = self.trigger.map(|trigger| format!("trigger = \"{}\"\n", trigger.name()));
         let region = self.region.map(|region| format!("region = {region:?}\n"));
         let exposure = self.exposure_us.map(|exposure_us| format!("exposure_us = {exposure_us:?}\n"));
         let subject = self.board.then(|| "subject = \"board\"\n".to_owned());
         let seconds = self.seconds.map(|seconds| format!("seconds = {seconds:?}\n"));
-        plan.extend([picture, region, exposure, subject, seconds].into_iter().flatten());
+        plan.extend([picture, trigger, region, exposure, subject, seconds].into_iter().flatten());
         plan
     }
 }
@@ -40,9 +41,9 @@ pub(super) fn change_or_plan(
     let status = client.status()?;
     let is_over = matches!(status.state, RunState::Idle | RunState::Faulted);
     if let (false, Some(_), None) = (is_over, &status.viewfinder, &arguments.plan) {
-        let ViewfinderArguments { picture, region, exposure_us, board, seconds, .. } = *arguments;
-        if board || seconds.is_some() {
-            let message = "a viewfinder runs, and --board and --seconds are for one that begins: end it with `raysweep cancel` first";
+        let ViewfinderArguments { picture, trigger, region, exposure_us, board, seconds, .. } = *arguments;
+        if board || seconds.is_some() || trigger.is_some() {
+            let message = "a viewfinder runs, and --board, --seconds and --trigger are for one that begins: end it with `raysweep cancel` first";
             return Err(ClientError::Rpc(RpcError::new(ErrorCode::Busy, message)).into());
         }
         client.viewfinder(&ViewfinderParams { picture, region, exposure_us })?;
@@ -63,6 +64,7 @@ pub(super) fn changed(printer: Printer) -> Result<Exit, CommandFailure> {
 #[cfg(test)]
 mod tests {
     use clap::Parser;
+    use raysweep_config::plan::FinderTrigger;
     use raysweep_config::{Plan, Procedure};
     use raysweep_core::FinderPicture;
 
@@ -70,8 +72,7 @@ mod tests {
 
     #[test]
     fn arguments_become_a_plan() {
-        let line =
-            "raysweep viewfinder --picture grid --region 1,2,3,4 --exposure-us 5 --board --seconds 2.5";
+        let line = "raysweep viewfinder --picture grid --trigger none --region 1,2,3,4 --exposure-us 5 --board --seconds 2.5";
         let Command::Viewfinder(arguments) = Arguments::parse_from(line.split(' ')).command else {
             panic!("another command")
         };
@@ -79,7 +80,7 @@ mod tests {
         let Procedure::Viewfinder(own) = plan.procedure else { panic!("{plan:?}") };
         assert_eq!((own.picture, own.region), (FinderPicture::Grid, Some([1, 2, 3, 4])));
         assert_eq!((own.exposure_us, own.seconds), (Some(5.0), Some(2.5)));
-        assert!(own.subject.is_some());
+        assert_eq!((own.trigger, own.subject.is_some()), (FinderTrigger::None, true));
     }
 
     #[test]

@@ -35,8 +35,11 @@ pub(super) fn examine(checkup: &mut Checkup) {
 
 fn versions(checkup: &mut Checkup) {
     let kernel = fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
-    let aravis = if cfg!(feature = "aravis") { "with" } else { "without" };
-    let found = format!("raysweepd {} {aravis} aravis, Linux {}", env!("CARGO_PKG_VERSION"), kernel.trim());
+    #[cfg(feature = "aravis")]
+    let aravis = format!("libaravis {}", raysweep_drivers::camera::aravis::version());
+    #[cfg(not(feature = "aravis"))]
+    let aravis = "without libaravis";
+    let found = format!("raysweepd {}, {aravis}, Linux {}", env!("CARGO_PKG_VERSION"), kernel.trim());
     checkup.ok("versions", found);
 }
 

@@ -9,6 +9,7 @@ use nix::unistd::{AccessFlags, Gid, Group, faccessat};
 use raysweep_config::rig::dots::DotCameraDriver;
 use raysweep_config::rig::plane::{CameraDriver, ProjectorDriver};
 use raysweep_config::rig::vsync::VsyncDriver;
+use raysweep_drivers::search::analysers;
 
 use super::checkup::Checkup;
 use super::host::user;
@@ -41,7 +42,11 @@ pub(super) fn of(rig: &SharedRig) -> Vec<NamedNode> {
                 VsyncDriver::TriggerBox => {
                     node("vsync.triggerbox.port", vsync.triggerbox.as_ref().map(|config| config.port.clone()))
                 }
-                VsyncDriver::Fx2Lafw | VsyncDriver::Sim => None,
+                // The rig file names none: its driver takes the only one on the USB.
+                VsyncDriver::Fx2Lafw => {
+                    node("vsync.fx2lafw", analysers().into_iter().next().map(|analyser| analyser.path))
+                }
+                VsyncDriver::Sim => None,
             };
             let card = (projector.driver == ProjectorDriver::Drm).then(|| projector.drm.card.clone());
             vec![

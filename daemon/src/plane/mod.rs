@@ -6,15 +6,19 @@ pub mod foresight;
 mod sink;
 
 use std::sync::Arc;
-use std::sync::mpsc::Receiver;
+use std::sync::mpsc::{Receiver, channel};
 use std::time::Duration;
 
+use ndarray::Array2;
 use raysweep_core::{
     Camera, CameraCapabilities, CameraSettings, Clock, Counts, DeviceError, Pattern, Projector, SettingsId,
     SettingsLatency, Shown, Subject, Vsync,
 };
 use raysweep_drivers::projector::external::ShowRequest;
-use raysweep_pipeline::{AssemblerConfig, Pipeline, PipelineConfig, Point, PointRole, Policy, Sink, Stages};
+use raysweep_pipeline::{
+    AssemblerConfig, Pipeline, PipelineConfig, Point, PointRole, Policy, SeenLight, Sink, Stages,
+    SweepGeometry,
+};
 use raysweep_processing::plane::{PlaneTask, place};
 use raysweep_proto::RunState;
 use raysweep_session::ledger::State;
@@ -22,7 +26,7 @@ use raysweep_session::stack::ArrayName;
 
 pub use self::sink::{PointSink, Verdict};
 use crate::devices::camera::{
-    Attempt, CameraThread, Drive, Exposures, FilmPass, FilmSetting, Gone, Pass, TriggerLine, Work,
+    Attempt, CameraThread, Drive, Exposures, FilmPass, FilmSetting, Glance, Gone, Pass, TriggerLine, Work,
 };
 use crate::devices::operator::{self, Operator};
 use crate::devices::vsync::VsyncThread;
@@ -37,6 +41,8 @@ const FRUITLESS_PASSES: u32 = 8;
 /// The rest after the first of these passes; it doubles each time, to twelve seconds in all, in which a disturbance
 /// may pass.
 const FIRST_REST: Duration = Duration::from_millis(100);
+/// Frames of a glance, in darkness and with light.
+const GLANCE_FRAMES: u32 = 4;
 /// Capacity of the assembler's event queue.
 const QUEUE_EVENTS: usize = 64;
 
@@ -106,6 +112,8 @@ pub struct Opened {
     board: Arc<StatusBoard>,
     /// Whether the devices or the pipeline set the pace.
     pub pace: Pace,
+    /// Whether the run looks for light before anything else, if it has a regular image.
+    pub looks_first: bool,
 }
 
 /// Result of acquisition.
@@ -144,7 +152,8 @@ impl Opened {
             edge_gate_us: rig.file.vsync.gate_us,
         };
         let (task, orders, board) = (task.clone(), run.orders.clone(), run.board.clone());
-        Ok(Self { task, camera, vsync, projector, stand, clock, assembler, orders, board, pace })
+        let looks_first = false;
+        Ok(Self { task, camera, vsync, projector, stand, clock, assembler, orders, board, pace, looks_first })
     }
 
     /// Capabilities of the camera.
@@ -165,7 +174,19 @@ impl Opened {
         results: &Receiver<Verdict>,
         points: impl FnOnce(&mut Passes<'_>) -> Result<(), RunError>,
     ) -> Result<Taken<S>, RunError> {
-        let Self { task, camera, vsync, projector, stand, clock, assembler, orders, board, pace } = self;
+        let Self {
+            task,
+            camera,
+            vsync,
+            projector,
+            stand,
+            clock,
+            assembler,
+            orders,
+            board,
+            pace,
+            looks_first,
+        } = self;
         let config = PipelineConfig {
             queue_events: QUEUE_EVENTS,
             policy: match pace {
@@ -196,8 +217,9 @@ impl Opened {
             trigger_latency_us,
         };
         let _ = board.go(RunState::Running);
-        let acquired = passes
-            .probe()
+        let looked = if looks_first { passes.look_for_light() } else { Ok(()) };
+        let acquired = looked
+            .and_then(|()| passes.probe())
             .map(|()| board.set_settings_latency(camera.latency()))
             .and_then(|()| points(&mut passes));
         let _ = board.go(RunState::Draining);
@@ -246,10 +268,15 @@ pub fn missing(task: &PlaneTask, state: &State) -> Vec<SettingsId> {
 pub fn regular_again(task: &PlaneTask, missing: &[SettingsId], state: &State) -> Option<SettingsId> {
     let points = &task.schedule.points;
     let regular = points.iter().position(|point| point.role == PointRole::Regular)? as u32;
-    let is_lit = |id: &SettingsId| !matches!(points[id.point as usize].role, PointRole::Dark(_));
     let is_missing = missing.iter().any(|id| id.point == regular);
     let attempt = state.next_attempt(ArrayName::Regular, 0);
-    (!is_missing && missing.iter().any(is_lit)).then_some(SettingsId { point: regular, attempt })
+    (!is_missing && is_any_lit(task, missing)).then_some(SettingsId { point: regular, attempt })
+}
+
+/// Whether any of these points is taken with light.
+pub fn is_any_lit(task: &PlaneTask, points: &[SettingsId]) -> bool {
+    let role = |id: &SettingsId| task.schedule.points[id.point as usize].role;
+    points.iter().any(|id| !matches!(role(id), PointRole::Dark(_)))
 }
 
 /// Makes passes over the points while the devices' threads run.
@@ -267,6 +294,39 @@ pub struct Passes<'a> {
 }
 
 impl Passes<'_> {
+    /// Compares a few frames with light with as many in darkness, by the regular image's settings, so that a run that
+    /// would measure nothing ends before its dark images. What so few frames cannot tell is left to the regular image.
+    /// A person who works the projector is not asked for it.
+    fn look_for_light(&mut self) -> Result<(), RunError> {
+        let regular = self.task.schedule.points.iter().find(|point| point.role == PointRole::Regular);
+        let Some(regular) = regular.copied().filter(|_| self.projector.operator.is_none()) else {
+            return Ok(());
+        };
+        let Some(dark) = self.glance(None, &regular)? else { return Ok(()) };
+        let Some(lit) = self.glance(Some(&Pattern::White), &regular)? else { return Ok(()) };
+        self.projector.show(None, self.orders)?;
+        let SweepGeometry { white_dn, saturation_dn, .. } = self.task.geometry;
+        match SeenLight::between(lit.view(), dark.view(), white_dn, saturation_dn) {
+            Some(none) if none.is_surely_none() => Err(RunError::no_regular_light(none)),
+            _ => Ok(()),
+        }
+    }
+
+    /// The mean of a few frames, in counts; `None` if the run is told to end.
+    fn glance(&mut self, pattern: Option<&Pattern>, point: &Point) -> Result<Option<Array2<f32>>, RunError> {
+        let Some(shown) = self.projector.show(pattern, self.orders)? else { return Ok(None) };
+        let settings = self.task.geometry.shot(point, self.trigger_latency_us).settings;
+        let (seen, sums) = channel();
+        let glance = Glance { settings, not_before_ns: shown.not_before_ns, frames: GLANCE_FRAMES, seen };
+        let glanced = self.camera.acquire(Work::Glance(glance)).map_err(|Gone| RunError::Interrupted)?;
+        self.results.iter().find(|verdict| matches!(verdict, Verdict::Flushed));
+        glanced?;
+        let size = (self.task.geometry.height, self.task.geometry.width);
+        let mean = |sum: u32| sum as f32 / GLANCE_FRAMES as f32;
+        let image = sums.try_recv().ok().and_then(|sums| Array2::from_shape_vec(size, sums).ok());
+        Ok(image.map(|sums| sums.mapv(mean)))
+    }
+
     /// Measures the settings latency, if the task has several settings.
     fn probe(&self) -> Result<(), RunError> {
         let mut settings = self.task.settings().map(|(_, point)| *point);

@@ -20,6 +20,7 @@ use raysweep_drivers::projector::external::{External, ShowRequest};
 use raysweep_sim::PlaneRig;
 
 use self::simulated::{Simulated, simulate};
+use self::vsync::Unwatched;
 
 pub use self::dots::{DotDevices, DotRig};
 pub use self::stand::Stand;
@@ -222,15 +223,6 @@ pub enum Pace {
     Devices,
 }
 
-impl Pace {
-    /// What to tell of the times of a run, if they are not those of the host's clock.
-    pub fn of_times(self) -> Option<String> {
-        let said =
-            "times of light are those of the simulated rig, which does not wait for the clock on the wall";
-        (self == Self::Pipeline).then(|| said.into())
-    }
-}
-
 impl Rig {
     /// Reads a rig file and builds what can be built without opening devices.
     ///
@@ -294,7 +286,34 @@ impl Rig {
     /// # Errors
     /// The devices that cannot be opened.
     pub fn open(&self) -> Result<Devices, RigError> {
-        let devices = self.open_each()?.all()?;
+        self.sound(self.open_each()?)
+    }
+
+    /// Opens what a viewfinder without the trigger needs: a camera that runs freely at this frame rate, and the
+    /// projector.
+    ///
+    /// # Errors
+    /// As [`Rig::open`].
+    pub fn open_free_running(&self, free_hz: f64) -> Result<Devices, RigError> {
+        self.sound(self.open_each_by(Some(free_hz))?)
+    }
+
+    /// Opens all devices to see that they are there. A missing watcher of the VSYNC is only logged: without it, the rig
+    /// can still be focused.
+    ///
+    /// # Errors
+    /// The other devices that cannot be opened.
+    pub fn look_for_camera(&self) -> Result<CameraCapabilities, RigError> {
+        let mut each = self.open_each()?;
+        if let Err(RigError::Device(error)) = &each.vsync {
+            tracing::warn!(%error, "until it can be opened, nothing runs but `raysweep viewfinder --trigger none`");
+            each.vsync = Ok(Box::new(Unwatched));
+        }
+        Ok(self.sound(each)?.camera.capabilities().clone())
+    }
+
+    fn sound(&self, opened: OpenedEach) -> Result<Devices, RigError> {
+        let devices = opened.all()?;
         self.check_rows(devices.camera.capabilities())?;
         Ok(devices)
     }
@@ -304,12 +323,19 @@ impl Rig {
     /// # Errors
     /// For a rig file whose devices do not go together.
     pub fn open_each(&self) -> Result<OpenedEach, RigError> {
+        self.open_each_by(None)
+    }
+
+    /// With `free_hz`, frames come at that rate, and nobody watches the VSYNC.
+    fn open_each_by(&self, free_hz: Option<f64>) -> Result<OpenedEach, RigError> {
         self.check_pace()?;
-        let mut simulated = Simulated::open(self)?;
-        let vsync = match vsync::open(&self.file.vsync) {
-            Ok(Some(real)) => Ok(real),
-            Ok(None) => simulated.vsync(),
-            Err(error) => Err(error.into()),
+        let mut simulated = Simulated::open(self, free_hz)?;
+        let vsync: Result<Box<dyn Vsync>, _> = match free_hz {
+            Some(_) => Ok(Box::new(Unwatched)),
+            None => vsync::open(&self.file.vsync).map_err(RigError::from).and_then(|real| match real {
+                Some(real) => Ok(real),
+                None => simulated.vsync(),
+            }),
         };
         let projector: Result<OpenProjector, _> = match self.file.projector.driver {
             ProjectorDriver::Drm => self.open_drm().map(|drm| (Box::new(drm) as _, None)),
@@ -325,8 +351,8 @@ impl Rig {
             |camera: Result<Box<dyn Camera>, RigError>| Ok((camera?, Clock::real(), simulated.stand()?));
         let camera = match self.file.camera.driver {
             CameraDriver::Sim => simulated.camera_and_stand(),
-            CameraDriver::Aravis => real(self.open_aravis()),
-            CameraDriver::V4l2 => real(self.open_v4l2()),
+            CameraDriver::Aravis => real(self.open_aravis(free_hz)),
+            CameraDriver::V4l2 => real(self.open_v4l2(free_hz)),
         };
         let by_the_clock = self.file.sim.realtime || self.file.camera.driver != CameraDriver::Sim;
         let pace = if by_the_clock { Pace::Devices } else { Pace::Pipeline };
@@ -350,13 +376,13 @@ impl Rig {
         Ok(DrmProjector::open(&config)?)
     }
 
-    fn open_v4l2(&self) -> Result<Box<dyn Camera>, RigError> {
+    fn open_v4l2(&self, free_hz: Option<f64>) -> Result<Box<dyn Camera>, RigError> {
         let RigFile { camera, vsync, .. } = &self.file;
-        let Some(config) = camera.v4l2.clone() else {
+        let Some(config) = &camera.v4l2 else {
             return Err(RigError::Config("[camera.v4l2] is missing".into()));
         };
         let setup = V4l2Setup {
-            config,
+            config: if free_hz.is_some() { config.free_running() } else { config.clone() },
             format: camera.pixel_format,
             row_time_us: self.file.camera_row_time_us(),
             trigger_period_us: vsync.period_us,
@@ -366,7 +392,7 @@ impl Rig {
     }
 
     #[cfg(feature = "aravis")]
-    fn open_aravis(&self) -> Result<Box<dyn Camera>, RigError> {
+    fn open_aravis(&self, free_hz: Option<f64>) -> Result<Box<dyn Camera>, RigError> {
         use raysweep_drivers::camera::aravis::{AravisCamera, RigFacts};
 
         let RigFile { camera, vsync, .. } = &self.file;
@@ -377,11 +403,13 @@ impl Rig {
             trigger_margin_us: vsync.gate_us,
             reopen: Duration::from_secs_f64(camera.reopen_s),
         };
-        Ok(Box::new(AravisCamera::open(&camera.aravis, facts)?))
+        let own = &camera.aravis;
+        let config = free_hz.map_or_else(|| own.clone(), |free_hz| own.free_running(free_hz));
+        Ok(Box::new(AravisCamera::open(&config, facts)?))
     }
 
     #[cfg(not(feature = "aravis"))]
-    fn open_aravis(&self) -> Result<Box<dyn Camera>, RigError> {
+    fn open_aravis(&self, _: Option<f64>) -> Result<Box<dyn Camera>, RigError> {
         Err(built_without_aravis())
     }
 }

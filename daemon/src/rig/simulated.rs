@@ -39,8 +39,8 @@ pub(super) struct Simulated {
 }
 
 impl Simulated {
-    /// Opens the simulated devices of a rig, if any.
-    pub(super) fn open(rig: &Rig) -> Result<Self, RigError> {
+    /// Opens the simulated devices of a rig, if any; with `free_hz`, its camera runs freely.
+    pub(super) fn open(rig: &Rig, free_hz: Option<f64>) -> Result<Self, RigError> {
         match (&rig.file.sim.bench, rig.simulated()) {
             (Some(_), _) if rig.file.camera.driver == CameraDriver::Sim => {
                 let message = "sim.bench: the camera of a bench is connected by a real wire: set camera.driver to the driver of that camera, or leave sim.bench out";
@@ -48,7 +48,11 @@ impl Simulated {
             }
             (Some(bench), _) => Ok(Self { bench: Some(bench.clone()), ..Self::default() }),
             (None, Some(sim)) => {
-                let PlaneDevices { camera, vsync, projector, subject, clock, .. } = sim.open();
+                let devices = sim.open();
+                if let Some(free_hz) = free_hz {
+                    devices.free_run(free_hz);
+                }
+                let PlaneDevices { camera, vsync, projector, subject, clock, .. } = devices;
                 let camera = Some((camera, clock));
                 let (vsync, projector, subject) = (Some(vsync), Some(projector), Some(subject));
                 Ok(Self { camera, vsync, projector, subject, bench: None })

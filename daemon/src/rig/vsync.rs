@@ -3,12 +3,22 @@
 use std::time::Duration;
 
 use raysweep_config::rig::vsync::{VsyncDriver, VsyncSection};
-use raysweep_core::{DeviceError, Vsync};
+use raysweep_core::{DeviceError, Edge, Vsync};
 use raysweep_drivers::vsync::fx2lafw::Fx2Lafw;
 use raysweep_drivers::vsync::modemline::ModemLine;
 use raysweep_drivers::vsync::pps::Pps;
 use raysweep_drivers::vsync::reopen::Reopened;
 use raysweep_drivers::vsync::triggerbox::TriggerBox;
+
+/// In place of a watcher where nobody looks at edges.
+pub struct Unwatched;
+
+impl Vsync for Unwatched {
+    fn next_edge(&mut self, timeout: Duration) -> Result<Option<Edge>, DeviceError> {
+        std::thread::sleep(timeout);
+        Ok(None)
+    }
+}
 
 /// Opens the watcher that a rig file names; `None`: the simulated one. If it is unplugged during a run, it is
 /// reopened.

@@ -30,6 +30,7 @@ impl StatusBoard {
             rig: rig.into(),
             state: RunState::Idle,
             question: None,
+            data: None,
             session: None,
             progress: None,
             vsync: None,

@@ -90,6 +90,14 @@ pub enum RunError {
     Panicked(String),
 }
 
+impl RunError {
+    /// A run whose regular image sees no light.
+    pub fn no_regular_light(seen: SeenLight) -> Self {
+        let cause = "the projector stays lit in the dark images too";
+        Self::NoLight { seen, cause, then: "`raysweep resume` the session" }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use std::fmt::Write;

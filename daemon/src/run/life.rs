@@ -204,6 +204,7 @@ fn finish(Ended { end, warnings, found }: Ended, board: &StatusBoard, dir: &Path
         found,
         final_s: end.final_s,
         light_s: end.light_s,
+        simulated_time: end.simulated_time,
     };
     if board.status().state != RunState::Draining && state == RunState::Idle {
         let _ = board.go(RunState::Draining);
@@ -231,6 +232,7 @@ pub fn end_entry(state: EndState, stored: usize, missing: usize) -> EndEntry {
         vsync: None,
         final_s: None,
         light_s: None,
+        simulated_time: false,
         settings_latency: None,
     }
 }

@@ -73,6 +73,7 @@ impl Fake {
             found: Vec::new(),
             final_s: None,
             light_s: None,
+            simulated_time: false,
         });
     }
 
@@ -210,6 +211,7 @@ impl Control for Fake {
             rig: "plane".into(),
             state,
             question: (state == RunState::Paused).then(|| "cover the lens".into()),
+            data: self.live.parent().map(Path::to_owned),
             session: Some(session()),
             progress: Some(progress()),
             vsync: Some(VsyncStats { edges: 10, period_us: 16_666.7, ..VsyncStats::default() }),

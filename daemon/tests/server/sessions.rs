@@ -124,6 +124,54 @@ fn sessions_are_moved_away_and_back_and_deleted_only_for_good() {
 }
 
 #[test]
+fn a_session_in_the_trash_is_restored_by_its_name() {
+    let daemon = Daemon::start();
+    let session = stored(daemon.folder.path(), "20260101-000000_sweep");
+    done(&["trash", text(&session)]);
+    // A name of neither here nor there, and one for which no daemon answers.
+    let by_name = |socket: &Path, name: &str| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_raysweep"));
+        command.arg("--socket").arg(socket).args(["restore", name]).output().unwrap()
+    };
+    for (socket, name) in
+        [(&*daemon.path, "20260102-000000_sweep"), (Path::new("/none"), "20260101-000000_sweep")]
+    {
+        let refused = by_name(socket, name);
+        let said = String::from_utf8_lossy(&refused.stderr).into_owned();
+        assert!(refused.status.code() == Some(1) && said.contains(name) && !session.exists(), "{said}");
+    }
+    let restored = by_name(&daemon.path, "20260101-000000_sweep");
+    let said = String::from_utf8_lossy(&restored.stdout).into_owned();
+    assert!(restored.status.success() && said.contains(text(&session)) && session.exists(), "{said}");
+}
+
+#[test]
+fn a_new_folder_that_processing_refuses_is_removed() {
+    let data = tempfile::tempdir().unwrap();
+    let (session, to) = (stored(data.path(), "20260101-000000_sweep"), data.path().join("again"));
+    let process = ["process", text(&session), "--to", text(&to)];
+    for refused in ["nonsense", "kind = \"nonsense\"", "kind = \"epipolar\", width_rows = 0"] {
+        let (exit, _, err) = run(&[&process[..], &["--product", refused]].concat());
+        assert!(exit != 0 && !err.contains("already exists") && !to.exists(), "{refused}: {err}");
+    }
+    let stack = fs::read_dir(session.join("stack.zarr")).unwrap().count();
+    let plan = fs::read_to_string(session.join("plan.toml")).unwrap();
+    fs::write(session.join("plan.toml"), "kind = 1").unwrap();
+    let (exit, _, err) = run(&process);
+    assert!(exit != 0 && err.contains("plan") && !to.exists(), "{err}");
+    fs::write(session.join("plan.toml"), plan).unwrap();
+    done(&process);
+    assert!(to.join("report.html").exists());
+    assert_eq!(
+        fs::read_dir(session.join("stack.zarr")).unwrap().count(),
+        stack,
+        "links, not the session's files"
+    );
+    let (exit, _, err) = run(&process);
+    assert!(exit == 1 && err.contains("already exists") && to.join("report.html").exists(), "{err}");
+}
+
+#[test]
 fn two_sessions_are_compared_by_settings_and_by_their_images() {
     let data = tempfile::tempdir().unwrap();
     let (a, b) = (stored(data.path(), "a"), stored(data.path(), "b"));

@@ -21,7 +21,7 @@ pub use self::patterns::{PatternPlan, PatternRefused, PatternsPlan};
 pub use self::response::ResponsePlan;
 pub use self::sweep::{Axis, GridPlan, SweepPlan};
 pub use self::tables::{ProductTable, StageTable, products_of_argument};
-pub use self::viewfinder::{FinderSubject, ViewfinderPlan};
+pub use self::viewfinder::{ALIGN_NEEDS_TRIGGER, FinderSubject, FinderTrigger, ViewfinderPlan};
 use crate::document::{Document, ReadingPurpose};
 use crate::{ConfigError, ConfigMistake, Places};
 

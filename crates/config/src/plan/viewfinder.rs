@@ -11,9 +11,11 @@ use crate::document::Document;
 pub struct ViewfinderPlan {
     /// What the projector shows at first.
     pub picture: FinderPicture,
+    /// What begins each frame; on a dot rig always the mirror.
+    pub trigger: FinderTrigger,
     /// What must stand before the camera; default: whatever does.
     pub subject: Option<FinderSubject>,
-    /// Exposure of each frame; default: 0.9 of the time from frame to frame.
+    /// Exposure of each frame; default: 0.9 of the projector's period, or all of it without the trigger.
     pub exposure_us: Option<f64>,
     /// Region of the focus score and the other figures: first row, row after the last, first column, column after the
     /// last; default: everything.
@@ -30,6 +32,9 @@ pub struct ViewfinderPlan {
     pub camera_rate_hz: f64,
 }
 
+/// Why rows cannot be aligned by a camera that runs freely.
+pub const ALIGN_NEEDS_TRIGGER: &str = "picture = \"align\" needs trigger = \"vsync\": a frame of a camera that runs freely may hold the light of two of its pictures";
+
 /// What stands before the camera of a plane rig.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -40,10 +45,35 @@ pub enum FinderSubject {
     Board,
 }
 
+/// What begins the frames of a plane rig's camera.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum FinderTrigger {
+    /// The projector's VSYNC, as in a run.
+    #[default]
+    Vsync,
+    /// Nothing: the camera runs freely, before any line is wired.
+    None,
+}
+
+impl FinderTrigger {
+    /// All of them, the default first.
+    pub const ALL: [Self; 2] = [Self::Vsync, Self::None];
+
+    /// Its name in a plan.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Vsync => "vsync",
+            Self::None => "none",
+        }
+    }
+}
+
 impl Default for ViewfinderPlan {
     fn default() -> Self {
         Self {
             picture: FinderPicture::White,
+            trigger: FinderTrigger::default(),
             subject: None,
             exposure_us: None,
             region: None,
@@ -78,6 +108,9 @@ impl ViewfinderPlan {
             );
             document.refuse(&["viewfinder", "region"], message);
         }
+        if self.picture == FinderPicture::Align && self.trigger == FinderTrigger::None {
+            document.refuse(&["viewfinder", "picture"], format!("viewfinder.{ALIGN_NEEDS_TRIGGER}"));
+        }
     }
 }
 
@@ -97,6 +130,8 @@ mod tests {
     fn what_makes_no_sense_is_refused_with_the_field_and_its_value() {
         for (line, told) in [
             ("picture = \"teapot\"", "picture"),
+            ("trigger = \"line0\"", "expected `vsync` or `none`"),
+            ("picture = \"align\"\ntrigger = \"none\"", "needs trigger = \"vsync\""),
             ("pictures_per_s = 31", "viewfinder.pictures_per_s = 31"),
             ("exposure_us = nan", "viewfinder.exposure_us = NaN"),
             ("seconds = 0", "viewfinder.seconds = 0"),

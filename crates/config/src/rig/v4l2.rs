@@ -20,6 +20,9 @@ pub struct V4l2Config {
     /// Control values, written in this order: automatic functions off, gain, blanking, trigger mode.
     #[serde(default)]
     pub controls: Vec<(String, i64)>,
+    /// Written after them where no trigger is wanted, by a viewfinder: trigger mode off.
+    #[serde(default)]
+    pub free_running: Vec<(String, i64)>,
     /// The exposure control; default: whichever of the kernel's the camera has.
     pub exposure: Option<TimeControl>,
     /// The trigger delay control, which only some makers provide; default: none.
@@ -64,6 +67,13 @@ impl V4l2Config {
         }
     }
 
+    /// The same camera without its trigger.
+    #[must_use]
+    pub fn free_running(&self) -> Self {
+        let controls = self.controls.iter().chain(&self.free_running).cloned().collect();
+        Self { controls, ..self.clone() }
+    }
+
     /// Faults that can be found without the camera.
     pub fn faults(&self) -> Vec<Fault> {
         let unit_us = |control: &Option<TimeControl>| control.as_ref().and_then(|c| c.unit_us).unwrap_or(1.0);
@@ -94,4 +104,20 @@ fn default_late_frames() -> u32 {
 }
 fn default_readout() -> Readout {
     Readout::Sequential
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_camera_without_its_trigger_has_what_says_so_written_last() {
+        let text = "device = \"/dev/video0\"\nwidth = 8\nheight = 8\ncontrols = [[\"trigger_mode\", 1], [\"gain\", 0]]\n\
+                    free_running = [[\"trigger_mode\", 0]]\n";
+        let config: V4l2Config = toml::from_str(text).unwrap();
+        let written = config.free_running().controls;
+        let names: Vec<(&str, i64)> = written.iter().map(|(name, value)| (name.as_str(), *value)).collect();
+        assert_eq!(names, [("trigger_mode", 1), ("gain", 0), ("trigger_mode", 0)]);
+        assert_eq!(config.controls.len(), 2, "runs keep their trigger");
+    }
 }

@@ -91,15 +91,20 @@ pub struct MirrorLimits {
 }
 
 impl MirrorLimits {
-    /// Mirrorcle A7B2.3-3600AL: 6.5 degrees and 200 Hz are from the maker. Steps of a tenth of the tilt, the slew of
-    /// a full sine at the bandwidth, and 1 % of the tilt above the bandwidth are [A].
-    pub const A7B2_3_3600AL: Self = Self {
-        max_tilt: MechanicalDeg(6.5),
-        max_step: MechanicalDeg(0.65),
-        max_slew_deg_per_s: 2.0 * PI * 200.0 * 6.5,
-        bandwidth_hz: 200.0,
-        out_of_band: MechanicalDeg(0.065),
-    };
+    /// Mirrorcle A7B2.3-3600AL, by its maker.
+    pub const A7B2_3_3600AL: Self = Self::by_tilt_and_bandwidth(6.5, 200.0);
+
+    /// The limits that the tilt and the bandwidth of a mirror's data sheet suggest. Steps of a tenth of the tilt, the
+    /// slew of a full sine at the bandwidth, and 1 % of the tilt above the bandwidth are [A].
+    pub const fn by_tilt_and_bandwidth(max_tilt_deg: f64, bandwidth_hz: f64) -> Self {
+        Self {
+            max_tilt: MechanicalDeg(max_tilt_deg),
+            max_step: MechanicalDeg(max_tilt_deg / 10.0),
+            max_slew_deg_per_s: 2.0 * PI * bandwidth_hz * max_tilt_deg,
+            bandwidth_hz,
+            out_of_band: MechanicalDeg(max_tilt_deg / 100.0),
+        }
+    }
 
     /// The tilts of a ramp at `rate_hz` that starts at rest at `from` (not included) and comes to rest at `to`: half
     /// a cosine, slow enough for the step, the slew and two periods of the bandwidth. A single tilt if the mirror is

@@ -80,6 +80,13 @@ pub fn copy_acquired(dir: &Path, to: &Path) -> Result<(), ProcessError> {
     // Nothing is acquired or processed meanwhile.
     let _locked = session.open_damaged()?;
     create_new(to)?;
+    // What is there of a copy that failed would be taken for a session.
+    copy_into(&session, to).inspect_err(|_| drop(std::fs::remove_dir_all(to)))
+}
+
+/// Copies what was acquired.
+fn copy_into(session: &Session, to: &Path) -> Result<(), ProcessError> {
+    let dir = session.dir();
     let made = [session.products_path(), session.transport_path(), session.transport_film_path()];
     for path in listed(dir).iter().filter(|path| !made.contains(path)) {
         let target = to.join(path.file_name().unwrap_or_default());

@@ -8,8 +8,8 @@ mod levels;
 use std::sync::Arc;
 
 use raysweep_config::Plan;
-use raysweep_config::plan::ViewfinderPlan;
-use raysweep_core::{CameraSettings, FinderPicture, Pattern};
+use raysweep_config::plan::{FinderTrigger, ViewfinderPlan};
+use raysweep_core::{CameraCapabilities, CameraSettings, FinderPicture, Pattern};
 use raysweep_pipeline::{Point, PointRole, Schedule};
 
 use crate::plane::{KnownRig, PlaneTask};
@@ -55,7 +55,9 @@ pub struct FinderTask {
 impl FinderTask {
     /// A viewfinder on a rig; see [`PlaneTask::new`].
     pub fn new(plan: &Plan, own: ViewfinderPlan, rig: &KnownRig<'_>) -> Self {
-        let exposure_us = own.exposure_us.unwrap_or(EXPOSED_SHARE * rig.file.raster().period_us);
+        // Without the trigger, a pixel sees its flash once wherever it falls only in an exposure of a whole period.
+        let share = if own.trigger == FinderTrigger::None { 1.0 } else { EXPOSED_SHARE };
+        let exposure_us = own.exposure_us.unwrap_or(share * rig.file.raster().period_us);
         let point = Point { role: PointRole::Sweep(0), delay_us: 0.0, exposure_us, frames: 1 };
         // No frame is matched with an edge.
         let task = PlaneTask::new(plan, Schedule { points: vec![point] }, f64::INFINITY, rig);
@@ -67,10 +69,22 @@ impl FinderTask {
         self.task.schedule.points[0].exposure_us
     }
 
-    /// Camera settings for an exposure centred on the light of each camera row's own projector row.
-    pub fn settings(&self, exposure_us: f64, trigger_latency_us: f64) -> CameraSettings {
+    /// Camera settings for an exposure centred on the light of each camera row's own projector row. Without the trigger,
+    /// the exposure begins wherever it does.
+    pub fn settings(&self, exposure_us: f64, camera: &CameraCapabilities) -> CameraSettings {
         let point = Point { exposure_us, ..self.task.schedule.points[0] };
-        self.task.geometry.shot(&point, trigger_latency_us).settings
+        let settings = self.task.geometry.shot(&point, camera.trigger_latency_us).settings;
+        match self.plan.trigger {
+            FinderTrigger::Vsync => settings,
+            FinderTrigger::None => {
+                CameraSettings { trigger_delay_us: *camera.trigger_delay_us.start(), ..settings }
+            }
+        }
+    }
+
+    /// The frame rate of a camera that runs freely: no more frames than are shown. `None`: it is triggered.
+    pub fn free_hz(&self) -> Option<f64> {
+        (self.plan.trigger == FinderTrigger::None).then_some(self.plan.pictures_per_s)
     }
 }
 

@@ -231,6 +231,9 @@ pub struct EndEntry {
     /// Seconds from the first frame with light to the end of the last, without the probe and the dark points.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub light_s: Option<f64>,
+    /// Whether `light_s` is time of a simulated rig, which does not wait for the clock on the wall.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub simulated_time: bool,
     /// Latency of the camera's settings, if a probe measured it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub settings_latency: Option<SettingsLatency>,

@@ -60,6 +60,7 @@ fn end(state: EndState) -> Entry {
         vsync,
         final_s,
         light_s,
+        simulated_time: false,
         settings_latency,
     })
 }

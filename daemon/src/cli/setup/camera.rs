@@ -1,6 +1,7 @@
 //! The questions about a camera.
 
 use raysweep_core::{Packing, PixelFormat};
+use raysweep_drivers::camera::CameraFacts;
 use toml::{Table, Value};
 
 use super::found::ConnectedDevices;
@@ -11,8 +12,8 @@ use crate::cli::failure::CommandFailure;
 const GENICAM: &str = "genicam";
 const V4L2: &str = "v4l2";
 const SIM: &str = "sim";
-/// Sides of a frame.
-const SIDE_PX: std::ops::RangeInclusive<u32> = 1..=65_536;
+/// The longest side of a frame.
+const MOST_PX: u32 = 65_536;
 
 /// The camera of the new rig.
 pub(super) enum ChosenCamera {
@@ -46,15 +47,6 @@ pub(super) struct TriggerSetup {
     latency_us: f64,
 }
 
-/// What a camera offers, as far as it is known.
-#[derive(Default)]
-struct Offered {
-    formats: Vec<PixelFormat>,
-    /// Rows and columns.
-    sizes: Vec<(u32, u32)>,
-    trigger_sources: Vec<String>,
-}
-
 impl ChosenCamera {
     /// Asks which camera, and how it is set.
     pub fn ask(
@@ -68,9 +60,14 @@ impl ChosenCamera {
         let default = choices[0].value.clone();
         let forms = ["genicam:NAME or ADDRESS", "v4l2:NODE"];
         let chosen = questions.choose("camera", "Which camera?", &choices, &forms, Some(&default))?;
+        let known = connected.cameras.iter().find(|eye| eye.value == chosen);
+        let known = known.and_then(|eye| eye.facts.clone());
         match chosen.split_once(':') {
-            Some((GENICAM, named)) => Self::genicam(questions, named, most_rows),
-            Some((V4L2, device)) => Self::v4l2(questions, device),
+            Some((GENICAM, named)) => {
+                let facts = known.map_or_else(|| offered_by_genicam(named), Ok)?;
+                Self::genicam(questions, named, &facts, most_rows)
+            }
+            Some((V4L2, device)) => Self::v4l2(questions, device, &known.unwrap_or_default(), most_rows),
             _ => Ok(Self::Sim),
         }
     }
@@ -78,11 +75,11 @@ impl ChosenCamera {
     fn genicam(
         questions: &mut Questions,
         named: &str,
+        facts: &CameraFacts,
         most_rows: Option<usize>,
     ) -> Result<Self, CommandFailure> {
-        let offered = offered_by_genicam(named)?;
-        let format = ask_format(questions, &offered)?;
-        let (sensor_rows, columns) = ask_size(questions, &offered)?;
+        let format = ask_format(questions, facts)?;
+        let (sensor_rows, columns) = ask_size(questions, facts, format, MOST_PX)?;
         let rows = most_rows.unwrap_or(usize::MAX).min(sensor_rows);
         // The middle of the sensor, where a camera sees more rows than the projector draws.
         let region = (rows < sensor_rows).then(|| {
@@ -90,9 +87,9 @@ impl ChosenCamera {
             [0, side((sensor_rows - rows) / 2), side(columns), side(rows)]
         });
         let sources: Vec<AnswerChoice> =
-            offered.trigger_sources.iter().map(|source| AnswerChoice::new(source, "")).collect();
+            facts.trigger_sources.iter().map(|source| AnswerChoice::new(source, "")).collect();
         let is_line = |source: &&String| source.starts_with("Line");
-        let first_line = offered.trigger_sources.iter().find(is_line).map_or("Line0", |source| source);
+        let first_line = facts.trigger_sources.iter().find(is_line).map_or("Line0", |source| source);
         let source = match sources.is_empty() {
             true => questions.text(
                 "trigger_source",
@@ -128,10 +125,15 @@ impl ChosenCamera {
         Ok(Self::Genicam { address, format, region, trigger, size: (rows, columns) })
     }
 
-    fn v4l2(questions: &mut Questions, device: &str) -> Result<Self, CommandFailure> {
-        let offered = offered_by_kernel(device);
-        let format = ask_format(questions, &offered)?;
-        let size = ask_size(questions, &offered)?;
+    fn v4l2(
+        questions: &mut Questions,
+        device: &str,
+        facts: &CameraFacts,
+        most_rows: Option<usize>,
+    ) -> Result<Self, CommandFailure> {
+        let format = ask_format(questions, facts)?;
+        let most_rows = most_rows.and_then(|rows| u32::try_from(rows).ok()).unwrap_or(MOST_PX);
+        let size = ask_size(questions, facts, format, most_rows)?;
         let controls = questions.text(
             "controls",
             "Controls that set the external trigger and fix the gain, as `v4l2-ctl --list-ctrls` spells them: NAME=VALUE, ... (empty: none)",
@@ -247,7 +249,7 @@ fn parse_controls(text: &str) -> Result<Vec<(String, i64)>, CommandFailure> {
 }
 
 /// The format with the most bits in the fewest bytes is the best.
-fn ask_format(questions: &mut Questions, offered: &Offered) -> Result<PixelFormat, CommandFailure> {
+fn ask_format(questions: &mut Questions, facts: &CameraFacts) -> Result<PixelFormat, CommandFailure> {
     let rank = |format: &PixelFormat| match format.packing {
         Packing::Bits12p | Packing::Bits12g24 => 0,
         Packing::Bits12Packed => 1,
@@ -257,7 +259,7 @@ fn ask_format(questions: &mut Questions, offered: &Offered) -> Result<PixelForma
         Packing::Bits10 => 5,
         Packing::Bits8 => 6,
     };
-    let mut formats = offered.formats.clone();
+    let mut formats: Vec<PixelFormat> = facts.formats.iter().map(|(format, _)| *format).collect();
     formats.sort_by_key(rank);
     let choices: Vec<AnswerChoice> =
         formats.iter().map(|format| AnswerChoice::new(format.to_string(), "")).collect();
@@ -271,42 +273,51 @@ fn ask_format(questions: &mut Questions, offered: &Offered) -> Result<PixelForma
         .map_err(|error: raysweep_core::UnknownPixelFormat| CommandFailure::Setup(format!("{KEY}: {error}")))
 }
 
-/// Rows and columns of a frame.
-fn ask_size(questions: &mut Questions, offered: &Offered) -> Result<(usize, usize), CommandFailure> {
-    let (rows, columns) = offered.sizes.first().copied().unwrap_or((720, 1280));
-    let width = questions.whole("width", "Columns of a frame", columns, SIDE_PX)?;
-    let height = questions.whole("height", "Rows of a frame", rows, SIDE_PX)?;
+/// Rows and columns of a frame of this format: by default its first size that does not have too many rows.
+fn ask_size(
+    questions: &mut Questions,
+    facts: &CameraFacts,
+    format: PixelFormat,
+    most_rows: u32,
+) -> Result<(usize, usize), CommandFailure> {
+    let sizes = facts.formats.iter().find(|(of, _)| *of == format).map_or(&[][..], |(_, sizes)| sizes);
+    let fitting = sizes.iter().find(|(rows, _)| *rows <= most_rows).or(sizes.first());
+    let (rows, columns) = fitting.copied().unwrap_or((720, 1280));
+    let width = questions.whole("width", "Columns of a frame", columns, 1..=MOST_PX)?;
+    let height = questions.whole("height", "Rows of a frame", rows.min(most_rows), 1..=most_rows)?;
     Ok((height as usize, width as usize))
 }
 
 #[cfg(feature = "aravis")]
-fn offered_by_genicam(named: &str) -> Result<Offered, CommandFailure> {
-    let facts = raysweep_drivers::camera::aravis::facts(named)?;
-    Ok(Offered {
-        formats: facts.pixel_formats,
-        sizes: facts.sensor.into_iter().collect(),
-        trigger_sources: facts.trigger_sources,
-    })
+fn offered_by_genicam(named: &str) -> Result<CameraFacts, CommandFailure> {
+    Ok(raysweep_drivers::camera::aravis::facts(named)?)
 }
 
 #[cfg(not(feature = "aravis"))]
-fn offered_by_genicam(_: &str) -> Result<Offered, CommandFailure> {
+fn offered_by_genicam(_: &str) -> Result<CameraFacts, CommandFailure> {
     Err(CommandFailure::WithoutAravis)
 }
 
-#[cfg(feature = "v4l2")]
-fn offered_by_kernel(device: &str) -> Offered {
-    let node =
-        raysweep_drivers::camera::v4l2::nodes().into_iter().find(|node| node.path.as_os_str() == device);
-    let formats = node.map(|node| node.formats).unwrap_or_default();
-    Offered {
-        sizes: formats.iter().flat_map(|(_, sizes)| sizes).map(|(width, height)| (*height, *width)).collect(),
-        formats: formats.into_iter().map(|(format, _)| format).collect(),
-        trigger_sources: Vec::new(),
-    }
-}
+#[cfg(test)]
+mod tests {
+    use super::*;
 
-#[cfg(not(feature = "v4l2"))]
-fn offered_by_kernel(_: &str) -> Offered {
-    Offered::default()
+    #[test]
+    fn the_default_size_is_one_of_the_chosen_format_with_no_more_rows_than_the_projector_draws() {
+        let (mono8, mono10): (PixelFormat, PixelFormat) =
+            ("Mono8".parse().unwrap(), "Mono10".parse().unwrap());
+        let formats = vec![(mono8, vec![(480, 640)]), (mono10, vec![(1080, 1920), (720, 1280)])];
+        let facts = CameraFacts { formats, ..CameraFacts::default() };
+        let size = |format, most_rows, answers: &str| {
+            let answers = answers.parse().unwrap();
+            let mut questions = Questions::File { path: "answers.toml".into(), answers };
+            ask_size(&mut questions, &facts, format, most_rows)
+        };
+        assert_eq!(size(mono8, 720, "").unwrap(), (480, 640));
+        assert_eq!(size(mono10, 720, "").unwrap(), (720, 1280));
+        assert_eq!(size(mono10, MOST_PX, "").unwrap(), (1080, 1920));
+        let refused = size(mono10, 720, "height = 1080").unwrap_err().to_string();
+        assert!(refused.contains("height = 1080; allowed: 1 to 720"), "{refused}");
+        assert_eq!(size("Mono12".parse().unwrap(), 480, "").unwrap(), (480, 1280), "nothing is known of it");
+    }
 }

@@ -1,6 +1,8 @@
 //! The questions about a dot rig.
 
+use raysweep_core::MirrorLimits;
 use raysweep_drivers::search::Answering;
+use toml::{Table, Value};
 
 use super::camera::ChosenCamera;
 use super::found::ConnectedDevices;
@@ -61,10 +63,8 @@ fn write_mirror(
         6.5,
         0.1..=45.0,
     )?;
-    let text = text
-        .key_with("full_scale_deg", full_scale_deg, "mechanical; from the mirror's data sheet")
-        .comment("The limits are those of an A7B2.3-3600AL. Another mirror may be destroyed by them: set")
-        .comment("limits = { max_tilt, max_step, max_slew_deg_per_s, bandwidth_hz, out_of_band } by its data sheet.");
+    let text = text.key_with("full_scale_deg", full_scale_deg, "mechanical; from the mirror's data sheet");
+    let text = write_limits(questions, text, full_scale_deg)?;
     let text = if driver == "optotune" {
         let laser = questions.text("laser_port", "Serial port whose RTS line enables the laser", "")?;
         if laser.is_empty() {
@@ -84,6 +84,53 @@ fn write_mirror(
         true => text.comment("No interlock: light needs `raysweep arm-light` after each boot."),
         false => text.key("interlock", interlock),
     })
+}
+
+/// Asks for the mirror's limits, because those of one mirror destroy another.
+fn write_limits(
+    questions: &mut Questions,
+    text: RigText,
+    full_scale_deg: f64,
+) -> Result<RigText, CommandFailure> {
+    let MirrorLimits { max_tilt, bandwidth_hz, .. } = MirrorLimits::A7B2_3_3600AL;
+    let max_tilt = questions.number(
+        "max_tilt",
+        "Limits of the mirror, by its data sheet: beyond them it may be destroyed. The defaults are those of an A7B2.3-3600AL, or follow from the first two.\nLargest mechanical tilt to either side, in degrees",
+        max_tilt.0.min(full_scale_deg),
+        0.01..=full_scale_deg,
+    )?;
+    let bandwidth_hz = questions.number("bandwidth_hz", "Bandwidth in hertz", bandwidth_hz, 1.0..=1e5)?;
+    let suggested = MirrorLimits::by_tilt_and_bandwidth(max_tilt, bandwidth_hz);
+    let max_step = questions.number(
+        "max_step",
+        "Largest step from one sample to the next, in degrees",
+        suggested.max_step.0,
+        1e-4..=max_tilt,
+    )?;
+    let max_slew = questions.number(
+        "max_slew_deg_per_s",
+        "Largest speed, in degrees per second",
+        (suggested.max_slew_deg_per_s * 100.0).round() / 100.0,
+        1e-3..=1e7,
+    )?;
+    let out_of_band = questions.number(
+        "out_of_band",
+        "What a path may hold beyond the bandwidth, in degrees, root mean square",
+        suggested.out_of_band.0,
+        0.0..=max_tilt,
+    )?;
+    let limits = [
+        ("max_tilt", max_tilt),
+        ("max_step", max_step),
+        ("max_slew_deg_per_s", max_slew),
+        ("bandwidth_hz", bandwidth_hz),
+        ("out_of_band", out_of_band),
+    ];
+    let limits = limits.map(|(key, value)| (key.to_owned(), Value::from(value)));
+    Ok(text
+        .comment("Beyond these the mirror may be destroyed. Unless from its data sheet, max_step, max_slew_deg_per_s and")
+        .comment("out_of_band are [A].")
+        .key("limits", Table::from_iter(limits)))
 }
 
 /// A few batches of few dots; the trailing dot shows at the lower edge of the picture.

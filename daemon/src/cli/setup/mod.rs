@@ -7,14 +7,13 @@ mod plane;
 mod questions;
 mod text;
 
-use std::fs::{self, File};
-use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use raysweep_config::rig::AnyRigFile;
 use raysweep_config::{ConfigError, Plan};
-use raysweep_core::io_text;
 use raysweep_drivers::search::ask;
+use raysweep_processing::ProcessError;
+use raysweep_session::durable;
 use serde_json::json;
 
 use self::found::{ConnectedDevices, answer_text};
@@ -48,12 +47,7 @@ pub struct SetupFiles<'a> {
 pub fn setup(files: &SetupFiles<'_>, printer: Printer) -> Result<Exit, CommandFailure> {
     let SetupFiles { answers, rig, plan, force } = *files;
     // Before anything is asked: answers should not be lost.
-    if let Some(there) = [rig, plan].into_iter().find(|path| !force && path.exists()) {
-        return Err(CommandFailure::Setup(format!(
-            "{} is there already: name another file with --rig or --plan, or replace it with --force",
-            there.display()
-        )));
-    }
+    [rig, plan].into_iter().try_for_each(|path| may_write(path, force))?;
     let mut questions = Questions::of(answers)?;
     let mut connected = ConnectedDevices::search();
     let is_spoken = !printer.json;
@@ -73,8 +67,11 @@ pub fn setup(files: &SetupFiles<'_>, printer: Printer) -> Result<Exit, CommandFa
     questions.finish()?;
     check(rig, &rig_text, AnyRigFile::parse(&rig_text).map(drop))?;
     check(plan, &plan_text, Plan::parse(&plan_text).map(drop))?;
-    write(rig, &rig_text, force)?;
-    write(plan, &plan_text, force)?;
+    for (path, text) in [(rig, &rig_text), (plan, &plan_text)] {
+        // It may have been made while the questions were asked.
+        may_write(path, force)?;
+        durable::write(path, text.as_bytes()).map_err(ProcessError::from)?;
+    }
     let value = json!({ "rig": rig, "plan": plan, "connected": connected });
     printer.print(&value, |_| {
         format!(
@@ -116,16 +113,12 @@ fn check(path: &Path, text: &str, parsed: Result<(), ConfigError>) -> Result<(),
     })
 }
 
-fn write(path: &Path, text: &str, force: bool) -> Result<(), CommandFailure> {
-    let failed = |source: io::Error| CommandFailure::Write { path: path.to_owned(), source };
-    if force {
-        return fs::write(path, text).map_err(failed);
+fn may_write(path: &Path, force: bool) -> Result<(), CommandFailure> {
+    match !force && path.exists() {
+        false => Ok(()),
+        true => Err(CommandFailure::Setup(format!(
+            "{} is there already: name another file with --rig or --plan, or replace it with --force",
+            path.display()
+        ))),
     }
-    let mut file = File::create_new(path).map_err(|error| match error.kind() {
-        io::ErrorKind::AlreadyExists => {
-            CommandFailure::Setup(format!("{}: {}", path.display(), io_text(&error)))
-        }
-        _ => failed(error),
-    })?;
-    file.write_all(text.as_bytes()).map_err(failed)
 }

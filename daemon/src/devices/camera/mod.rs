@@ -1,6 +1,7 @@
 //! The camera's thread: sets the camera for each point in turn and forwards its frames.
 
 mod ahead;
+mod glance;
 mod probe;
 mod sequence;
 mod sets;
@@ -19,6 +20,7 @@ use raysweep_pipeline::{DeviceEvent, Failure, Input, Label, Point, QueueError, S
 
 pub use self::ahead::TriggerLine;
 use self::ahead::{Ahead, Seen};
+pub use self::glance::Glance;
 pub use self::sequence::{FilmPass, FilmSetting};
 use super::priority;
 use crate::rig::Pace;
@@ -62,6 +64,8 @@ pub struct Pass {
 /// Work for the camera until its next flush.
 #[derive(Debug, Clone)]
 pub enum Work {
+    /// Take a few frames of no point.
+    Glance(Glance),
     /// Measure the settings latency, by changing from and to these settings.
     Probe(CameraSettings),
     /// Points, each until all its frames have arrived, and until all are decided.
@@ -116,6 +120,8 @@ pub struct Exposures {
     pub until: Option<Instant>,
     /// From the start of the first lit exposure to the end of the last, on the camera's clock.
     lit_ns: Option<(i64, i64)>,
+    /// Whether that clock is virtual.
+    pub is_simulated: bool,
 }
 
 impl Exposures {
@@ -268,7 +274,8 @@ impl Acquisition {
             told_seq: None,
             lead_ins: 0,
             is_led_in: false,
-            exposures: Exposures::default(),
+            // Where the devices of a plane rig wait for the pipeline, they are simulated.
+            exposures: Exposures { is_simulated: pace == Pace::Pipeline, ..Exposures::default() },
         }
     }
 
@@ -277,6 +284,7 @@ impl Acquisition {
         // Frames since the last work do not count: an operator may have taken minutes to change the projected image.
         self.told_seq = None;
         let acquired = match work {
+            Work::Glance(glance) => self.glance(&glance),
             Work::Probe(settings) => self.probe(&settings).map(|found| {
                 if let Some(found) = found {
                     latency.get_or_init(|| found);

@@ -57,7 +57,7 @@ impl Acquisition {
     }
 
     /// Skips frames until settings may be written.
-    fn pass_until_due(&mut self) -> Result<(), DeviceError> {
+    pub(super) fn pass_until_due(&mut self) -> Result<(), DeviceError> {
         let mut watchdog = Watchdog::default();
         while self.orders.go_on() {
             let now_ns = self.clock.now_ns();
@@ -79,7 +79,7 @@ impl Acquisition {
 
     /// Skips frames until the last settings are certainly in force; returns their latency in frames, if it was
     /// observed.
-    fn see_through(&mut self) -> Result<Option<u32>, DeviceError> {
+    pub(super) fn see_through(&mut self) -> Result<Option<u32>, DeviceError> {
         let mut watchdog = Watchdog::default();
         let mut late_frames = None;
         while self.orders.go_on() && !self.ahead.is_idle() {

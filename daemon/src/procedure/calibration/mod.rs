@@ -177,6 +177,7 @@ impl Measurement for CalibrationRun {
             error: fault.map(|fault| fault.to_string()),
             vsync,
             light_s: exposures.light_s(),
+            simulated_time: exposures.is_simulated,
             settings_latency: latency,
             ..end_entry(state, stored, ledger.state().missing_points())
         };

@@ -114,8 +114,6 @@ struct Acquired {
     latency: Option<SettingsLatency>,
     /// The fault that ended acquisition early, if any.
     fault: Option<RunError>,
-    /// What to tell of its times, if they are simulated.
-    simulated: Option<String>,
 }
 
 impl FilmRun {
@@ -133,7 +131,6 @@ impl FilmRun {
         let cycles = CyclePlan::new(task, opened.camera());
         let account = Arc::new(Account::new(film.points()));
         let frames = self.cycles(&run, &cycles, opened.camera(), opened.pace, &account)?;
-        let simulated = opened.pace.of_times();
         let planned = missing.len() + film.points();
         let processing = Processing::without_demux(self.stages.clone());
         // A film's own transports serve as its live estimate.
@@ -170,7 +167,6 @@ impl FilmRun {
             exposures,
             latency,
             fault: points.write_error.map(RunError::from).or(no_light).or(fault),
-            simulated,
         })
     }
 
@@ -224,8 +220,7 @@ impl FilmRun {
 /// a short one; but its products are not made, so that it ends soon.
 fn conclude(acquired: Acquired, run: &FilmRun, orders: &Orders) -> Result<Ended, RunError> {
     let FilmRun { rig, film, products, .. } = run;
-    let Acquired { session, mut ledger, mut problems, vsync, exposures, latency, fault, simulated } =
-        acquired;
+    let Acquired { session, mut ledger, mut problems, vsync, exposures, latency, fault } = acquired;
     let state = end_state(fault.as_ref(), orders);
     let stored = ledger.state().stored_points();
     let end = EndEntry {
@@ -233,6 +228,7 @@ fn conclude(acquired: Acquired, run: &FilmRun, orders: &Orders) -> Result<Ended,
         vsync,
         final_s: exposures.until.map(|until| until.elapsed().as_secs_f64()),
         light_s: exposures.light_s(),
+        simulated_time: exposures.is_simulated,
         settings_latency: latency,
         ..end_entry(state, stored, ledger.state().missing_points())
     };
@@ -254,5 +250,5 @@ fn conclude(acquired: Acquired, run: &FilmRun, orders: &Orders) -> Result<Ended,
     }
     let missing = ledger.state().film.as_ref().map_or(0, |film| film.transports_missing);
     problems.extend(shortcomings(ledger.state(), missing));
-    Ok(Ended { end, warnings: problems, found: simulated.into_iter().collect() })
+    Ok(Ended { end, warnings: problems, found: Vec::new() })
 }

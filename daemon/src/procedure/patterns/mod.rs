@@ -15,7 +15,7 @@ use raysweep_session::Session;
 use raysweep_session::ledger::{EndEntry, EndState, Entry};
 use raysweep_session::stack::StackShape;
 
-use crate::plane::{Opened, Passes, PointSink, Taken, missing, regular_again};
+use crate::plane::{Opened, Passes, PointSink, Taken, is_any_lit, missing, regular_again};
 use crate::procedure::lab::{Lab, RigOfRun, keep_calibration};
 use crate::rig::Rig;
 use crate::run::error::RunError;
@@ -63,36 +63,33 @@ impl Measurement for PatternsRun {
         run.note_beginning()?;
         let Self { rig, patterns, .. } = *self;
         let task = &patterns.task;
-        let opened = Opened::open(&rig, task, &run)?;
+        let mut opened = Opened::open(&rig, task, &run)?;
         let (stack, state) = (run.session.stack()?, run.ledger.state().clone());
         if let Some(what) = task.unlike(&state) {
             return Err(RunError::OtherPlan(what));
         }
         let missing = missing(task, &state);
         let again = regular_again(task, &missing, &state);
+        opened.looks_first = is_any_lit(task, &missing);
         let stages: Arc<[_]> = Arc::new([]);
         let processing = Processing::without_demux(stages.clone());
         let planned = task.schedule.points.len();
         let progress = ProgressMeter::new(&run.orders, planned - missing.len(), planned);
         let (sink, results) = PointSink::new(task, run, stack, processing, progress);
-        let simulated = opened.pace.of_times();
         let taken = opened.acquire(stages, UNITS_UNDER_WAY, sink, &results, |passes| {
             acquire(passes, &patterns, again.into_iter().chain(missing).collect())
         })?;
         let Taken { sink: PointSink { run, vsync, write_error, no_light, .. }, exposures, latency, fault } =
             taken;
         let Run { session, mut ledger, orders, .. } = run;
-        let no_light = no_light.map(|seen| RunError::NoLight {
-            seen,
-            cause: "the projector stays lit in the dark images too",
-            then: "`raysweep resume` the session",
-        });
+        let no_light = no_light.map(RunError::no_regular_light);
         let fault = write_error.map(RunError::from).or(no_light).or(fault);
         let state = end_state(fault.as_ref(), &orders);
         let end = EndEntry {
             error: fault.map(|fault| fault.to_string()),
             vsync,
             light_s: exposures.light_s(),
+            simulated_time: exposures.is_simulated,
             settings_latency: latency,
             ..end_entry(state, ledger.state().stored_points(), ledger.state().missing_points())
         };
@@ -104,7 +101,7 @@ impl Measurement for PatternsRun {
             }
             EndState::Cancelled | EndState::Faulted => Vec::new(),
         };
-        Ok(Ended { end, warnings, found: simulated.into_iter().collect() })
+        Ok(Ended { end, warnings, found: Vec::new() })
     }
 }
 

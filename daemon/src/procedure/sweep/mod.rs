@@ -21,7 +21,7 @@ use raysweep_session::stack::StackShape;
 use crate::devices::camera::Exposures;
 use crate::live::{LiveEstimate, Outlet};
 use crate::plane::advice::{advise, design};
-use crate::plane::{Opened, Passes, PointSink, Taken, missing, regular_again};
+use crate::plane::{Opened, Passes, PointSink, Taken, is_any_lit, missing, regular_again};
 use crate::procedure::lab::{Lab, RigOfRun, keep_calibration};
 use crate::rig::Rig;
 use crate::run::error::RunError;
@@ -118,8 +118,6 @@ struct Acquired {
     latency: Option<SettingsLatency>,
     /// The fault that ended acquisition early, if any.
     fault: Option<RunError>,
-    /// What to tell of its times, if they are simulated.
-    simulated: Option<String>,
 }
 
 /// Acquires what is missing.
@@ -131,7 +129,7 @@ fn acquire(
 ) -> Result<Acquired, RunError> {
     run.note_beginning()?;
     let task = &sweep.task;
-    let opened = Opened::open(rig, task, &run)?;
+    let mut opened = Opened::open(rig, task, &run)?;
     let stack = run.session.stack()?;
     let state = run.ledger.state().clone();
     if let Some(what) = task.unlike(&state) {
@@ -145,17 +143,13 @@ fn acquire(
     let live = run.live.clone().and_then(start_live);
     let (mut sink, results) = PointSink::new(task, run, stack, processing, progress);
     sink.live = live;
-    let simulated = opened.pace.of_times();
     let again = regular_again(task, &missing, &state);
+    opened.looks_first = is_any_lit(task, &missing);
     let taken = opened.acquire(stages, UNITS_UNDER_WAY, sink, &results, |passes| {
         acquire_points(passes, sweep, again, missing)
     })?;
     let Taken { sink, exposures, latency, fault } = taken;
-    let no_light = sink.no_light.map(|seen| RunError::NoLight {
-        seen,
-        cause: "the projector stays lit in the dark images too",
-        then: "`raysweep resume` the session",
-    });
+    let no_light = sink.no_light.map(RunError::no_regular_light);
     Ok(Acquired {
         session: sink.run.session,
         ledger: sink.run.ledger,
@@ -164,7 +158,6 @@ fn acquire(
         exposures,
         latency,
         fault: sink.write_error.map(RunError::from).or(no_light).or(fault),
-        simulated,
     })
 }
 
@@ -210,7 +203,7 @@ fn conclude(
     live: Option<&Outlet>,
 ) -> Result<Ended, RunError> {
     let task = &*sweep.task;
-    let Acquired { session, mut ledger, processing, vsync, exposures, latency, fault, simulated } = acquired;
+    let Acquired { session, mut ledger, processing, vsync, exposures, latency, fault } = acquired;
     let whole = fault.is_none() && missing(task, ledger.state()).is_empty();
     let began = Instant::now();
     let make = || match in_strips {
@@ -228,6 +221,7 @@ fn conclude(
         error: fault.map(|fault| fault.to_string()),
         vsync,
         light_s: exposures.light_s(),
+        simulated_time: exposures.is_simulated,
         settings_latency: latency,
         ..end_entry(state, stored, ledger.state().missing_points())
     };
@@ -247,11 +241,7 @@ fn conclude(
     } else {
         ledger.append(&Entry::End(end.clone()))?;
     }
-    Ok(Ended {
-        end,
-        warnings: results.map_or_else(Vec::new, Results::into_warnings),
-        found: simulated.into_iter().collect(),
-    })
+    Ok(Ended { end, warnings: results.map_or_else(Vec::new, Results::into_warnings), found: Vec::new() })
 }
 
 /// Publishes the result where the earlier estimates were published.

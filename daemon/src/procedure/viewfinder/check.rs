@@ -1,6 +1,6 @@
 //! Checks a viewfinder's plan, before anything moves.
 
-use raysweep_config::plan::ViewfinderPlan;
+use raysweep_config::plan::{FinderTrigger, ViewfinderPlan};
 use raysweep_config::{ConfigError, Plan};
 use raysweep_core::FinderPicture;
 use raysweep_processing::viewfinder::FinderTask;
@@ -27,7 +27,7 @@ pub fn report(plan: &ViewfinderPlan, lab: &Lab<'_>) -> CheckReport {
 /// # Errors
 /// For what the camera cannot do, or a region outside of its frames.
 pub fn plane(plan: &Plan, task: &FinderTask, lab: &Lab<'_>) -> Result<(), ConfigError> {
-    let settings = task.settings(task.exposure_us(), lab.camera.trigger_latency_us);
+    let settings = task.settings(task.exposure_us(), lab.camera);
     lab.camera.allows(&settings).map_err(|message| {
         plan.places.error(&["viewfinder", "exposure_us"], format!("viewfinder.{message}"))
     })?;
@@ -46,6 +46,11 @@ pub fn dots(plan: &Plan, own: &ViewfinderPlan, rig: &DotRig, lab: &Lab<'_>) -> R
     if own.picture == FinderPicture::Align {
         let message = "viewfinder.picture = \"align\": a dot rig has no rows to align; give \"white\"";
         return Err(refuse("picture", message.into()));
+    }
+    if own.trigger == FinderTrigger::None {
+        let message =
+            "viewfinder.trigger = \"none\": the mirror of a dot rig triggers its camera; leave it out";
+        return Err(refuse("trigger", message.into()));
     }
     dots::path(rig, own, own.picture)
         .map_err(|error| refuse("tilt_deg", format!("viewfinder.tilt_deg: {error}")))?;

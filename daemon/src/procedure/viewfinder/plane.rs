@@ -2,10 +2,10 @@
 
 use std::time::{Duration, Instant};
 
-use raysweep_config::plan::FinderSubject;
+use raysweep_config::plan::{ALIGN_NEEDS_TRIGGER, FinderSubject};
 use raysweep_core::{
     Camera, CameraCapabilities, DeviceError, DeviceErrorKind, FinderPicture, FrameBuf, FramePool, FrameStamp,
-    Pattern, SettingsId, Subject,
+    SettingsId, Subject,
 };
 use raysweep_processing::viewfinder::{AlignPictures, CountScale, FinderTask, SeenRows, pattern_of};
 use raysweep_proto::{RowAlignment, RunState, ViewfinderParams};
@@ -23,12 +23,17 @@ const POLL: Duration = Duration::from_millis(50);
 /// A camera without frames for this long lacks its trigger.
 const PATIENCE: Duration = Duration::from_secs(2);
 
+const NO_TRIGGER: &str = "no frame for 2 s: the camera gets no trigger; check that the projector is on, and that its VSYNC line reaches the camera; `raysweep viewfinder --trigger none` needs no VSYNC, once this one is ended";
+const NO_FRAMES: &str = "no frame for 2 s, though the camera should run freely; check its cable, and that nothing sets its trigger: camera.aravis.features, or camera.v4l2.controls without camera.v4l2.free_running";
+
 /// Shows pictures until the run is told to end, or the plan's time is over.
 ///
 /// # Errors
 /// When a device fails.
 pub fn view(rig: &Rig, task: FinderTask, run: &Run) -> Result<(), RunError> {
-    let Devices { camera, vsync, projector, questions, stand, pace, .. } = run.probes.instead_of(rig.open()?);
+    let free_hz = task.free_hz();
+    let opened = free_hz.map_or_else(|| rig.open(), |free_hz| rig.open_free_running(free_hz))?;
+    let Devices { camera, vsync, projector, questions, stand, pace, .. } = run.probes.instead_of(opened);
     // Nobody looks at edges.
     drop(vsync);
     let projector = LitProjector::new(projector, questions, run)?;
@@ -117,9 +122,10 @@ impl Viewer<'_> {
                     waiting = Instant::now();
                     self.frame(&stamp)?;
                 }
-                None if waiting.elapsed() > PATIENCE => self.finder.complain(
-                    "no frame for 2 s: the camera gets no trigger; check that the projector is on, and that its VSYNC line reaches the camera",
-                ),
+                None if waiting.elapsed() > PATIENCE => self.finder.complain(match self.task.free_hz() {
+                    None => NO_TRIGGER,
+                    Some(_) => NO_FRAMES,
+                }),
                 None => {}
             }
         }
@@ -146,7 +152,7 @@ impl Viewer<'_> {
 
     /// Writes the exposure.
     fn expose(&mut self) -> Result<(), RunError> {
-        let settings = self.task.settings(self.finder.exposure_us(), self.capabilities.trigger_latency_us);
+        let settings = self.task.settings(self.finder.exposure_us(), &self.capabilities);
         let applied = self.camera.configure(SettingsId { point: 0, attempt: self.writes }, &settings);
         self.writes += 1;
         match applied {
@@ -162,6 +168,9 @@ impl Viewer<'_> {
     /// Shows the picture, or the next one of a series.
     fn light(&mut self) -> Result<(), RunError> {
         let pattern = match self.finder.picture() {
+            FinderPicture::Align if self.task.free_hz().is_some() => {
+                return self.refused(ALIGN_NEEDS_TRIGGER.into());
+            }
             FinderPicture::Align => Some(self.rows.next().clone()),
             picture => pattern_of(picture),
         };
@@ -169,20 +178,22 @@ impl Viewer<'_> {
             Ok(Some(shown)) => self.shown_ns = shown.not_before_ns,
             // The run was ended while an operator was asked.
             Ok(None) => {}
-            Err(error) if is_refused(&error) => self.refused(pattern.as_ref(), &error)?,
+            Err(error) if is_refused(&error) => {
+                let what = pattern.map_or_else(String::new, |pattern| format!("cannot show {pattern}: "));
+                self.refused(format!("{what}{error}"))?;
+            }
             Err(error) => return Err(error.into()),
         }
         Ok(())
     }
 
     /// Goes on without light where a picture cannot be shown.
-    fn refused(&mut self, pattern: Option<&Pattern>, error: &DeviceError) -> Result<(), RunError> {
-        let what = pattern.map_or_else(String::new, |pattern| format!("cannot show {pattern}: "));
+    fn refused(&mut self, why: String) -> Result<(), RunError> {
         self.finder.change(&ViewfinderParams { picture: Some(FinderPicture::Black), ..Default::default() });
         if let Some(shown) = self.projector.show(None, self.orders)? {
             self.shown_ns = shown.not_before_ns;
         }
-        self.finder.complain(format!("{what}{error}"));
+        self.finder.complain(why);
         Ok(())
     }
 

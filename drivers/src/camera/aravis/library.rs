@@ -1,6 +1,6 @@
 //! Interface to libaravis: finding and opening cameras, their features and their clock.
 
-use std::ffi::CStr;
+use std::ffi::{CStr, c_uint};
 use std::net::IpAddr;
 use std::ops::RangeInclusive;
 use std::sync::atomic::{AtomicI64, Ordering};
@@ -37,6 +37,18 @@ static LIBRARY: Mutex<Option<Aravis>> = Mutex::new(None);
 
 fn library() -> MutexGuard<'static, Option<Aravis>> {
     LIBRARY.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// The version of libaravis that this process has loaded.
+#[allow(unsafe_code, reason = "the bindings lack these functions of C")]
+pub fn version() -> String {
+    // SAFETY: as libaravis' arvmisc.h declares them; they take nothing and return constants.
+    unsafe extern "C" {
+        safe fn arv_get_major_version() -> c_uint;
+        safe fn arv_get_minor_version() -> c_uint;
+        safe fn arv_get_micro_version() -> c_uint;
+    }
+    format!("{}.{}.{}", arv_get_major_version(), arv_get_minor_version(), arv_get_micro_version())
 }
 
 /// Searches all networks and the USB for cameras; takes about a second.

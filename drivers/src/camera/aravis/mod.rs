@@ -22,8 +22,8 @@ mod settings;
 mod setup;
 
 pub use driver::{AravisCamera, RigFacts};
-pub use facts::{CameraFacts, facts};
+pub use facts::facts;
 pub use file::{RefusedLine, load_features, save_features};
-pub use library::{FoundCamera, discover};
+pub use library::{FoundCamera, discover, version};
 pub use network::SocketBuffer;
 pub use raysweep_config::rig::aravis::{AravisConfig, SensorRegion, TimestampAt};

@@ -182,6 +182,20 @@ fn set_chunks(features: &impl Features) -> Result<ChunksOn> {
     Ok(on)
 }
 
+/// Sets the rate of a free-running camera. Without it, a camera may go as fast as it can, with short exposures alone.
+fn set_rate(features: &impl Features, config: &AravisConfig) -> Result<()> {
+    const RATE: &str = "AcquisitionFrameRate";
+    let Some(free_hz) = config.free_hz else { return Ok(()) };
+    if features.has("AcquisitionFrameRateEnable") {
+        put_boolean(features, "AcquisitionFrameRateEnable", true)?;
+    }
+    if features.has(RATE) {
+        let range = features.float_range(RATE)?;
+        features.set_float(RATE, free_hz.max(*range.start()).min(*range.end()))?;
+    }
+    Ok(())
+}
+
 fn set_trigger(features: &impl Features, config: &AravisConfig) -> Result<()> {
     // A frame rate set in the camera would delay triggers.
     if config.is_triggered() && features.has("AcquisitionFrameRateEnable") {
@@ -194,7 +208,7 @@ fn set_trigger(features: &impl Features, config: &AravisConfig) -> Result<()> {
         }
     }
     if !config.is_triggered() {
-        return Ok(());
+        return set_rate(features, config);
     }
     if features.has("TriggerSelector") {
         put_text(features, "TriggerSelector", "FrameStart")?;
@@ -309,6 +323,16 @@ mod tests {
         let set_up = set_up(&camera, &config, PixelFormat::Mono8).unwrap();
         assert_eq!((set_up.width, set_up.height), (1600, 1200));
         assert_eq!(camera.text("TriggerMode").unwrap(), "Off");
+
+        let rated = sfnc()
+            .with("AcquisitionFrameRateEnable", Value::Boolean(false))
+            .with("AcquisitionFrameRate", Value::Float(160.0, 1.0..=160.0));
+        super::set_up(&rated, &self::config().free_running(15.0), PixelFormat::Mono8).unwrap();
+        assert_eq!(rated.text("TriggerMode").unwrap(), "Off");
+        let rate_hz = |camera: &Scripted| camera.float("AcquisitionFrameRate").unwrap();
+        assert_eq!((rated.boolean("AcquisitionFrameRateEnable"), rate_hz(&rated)), (Ok(true), 15.0));
+        super::set_up(&rated, &self::config().free_running(0.1), PixelFormat::Mono8).unwrap();
+        assert_eq!(rate_hz(&rated), 1.0, "the slowest that it can");
     }
 
     #[test]
