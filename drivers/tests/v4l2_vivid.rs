@@ -46,6 +46,7 @@ impl Device {
                 width: WIDTH,
                 height: HEIGHT,
                 controls: controls.map(|(name, value)| ((*name).to_owned(), *value)).collect(),
+                free_running: Vec::new(),
                 exposure: Some(TimeControl { control: "brightness".into(), unit_us: Some(10.0) }),
                 trigger_delay: None,
                 frames_per_s: None,
