@@ -98,11 +98,13 @@ export function paint(canvas, picture, colours, low, high) {
 /**
  * A picture with its tools, in `place`. `onpixel(row, column)` is called for the pixel under the cursor, and, while
  * `selects` is set, `onregion([top, bottom, left, right])` for pixels over which the pointer is dragged. `marks` may
- * have a `frame` around such a region, and a `cross` at a row and column.
+ * have a `frame` around such a region, and a `cross` at a row and column. Automatic limits are those of the values in
+ * `range`, otherwise of the picture's own.
  */
 export class Picture {
-  constructor(place, { label, colours = "grey", onpixel = () => {}, onregion = () => {}, symmetric = false }) {
+  constructor(place, { label, colours = "grey", onpixel = () => {}, onregion = () => {}, symmetric = false, range }) {
     this.colours = colours;
+    this.range = range;
     this.symmetric = symmetric;
     this.onpixel = onpixel;
     this.onregion = onregion;
@@ -162,7 +164,7 @@ export class Picture {
   draw() {
     if (!this.picture) return;
     if (this.auto.checked) {
-      let [low, high] = quantiles(this.picture.values, [0.005, 0.995]);
+      let [low, high] = quantiles(this.range ?? this.picture.values, [0.005, 0.995]);
       if (this.symmetric) { high = Math.max(Math.abs(low), Math.abs(high)) || 1; low = -high; }
       else low = Math.min(low, 0);
       if (high <= low) high = low + 1;

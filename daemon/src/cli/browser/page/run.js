@@ -73,7 +73,10 @@ async function refresh() {
   if (!result) return;
   status = result;
   if (result.vsync) tellVsync(result.vsync);
-  showFinder(UNDER_WAY.includes(result.state) ? result.viewfinder : null);
+  const finder = UNDER_WAY.includes(result.state) ? result.viewfinder : null;
+  // Nobody looks at edges during a viewfinder, so these are those of the run before.
+  by("vsync-card").hidden = !result.vsync || Boolean(finder);
+  showFinder(finder);
   draw();
 }
 
@@ -92,18 +95,20 @@ function draw() {
   by("state").textContent = state ? words(state) : "not connected";
   by("state").dataset.state = state ?? "lost";
   const done = isUnderWay && progress ? `${progress.points_stored}/${progress.points_planned} – ` : "";
-  document.title = `${done}raysweep`;
+  document.title = question ? "waits for you – raysweep" : `${done}raysweep`;
   document.body.classList.toggle("observes", role === "observer");
   document.body.classList.toggle("under-way", isUnderWay);
   by("observer-text").textContent = operators
     ? `To operate it, have root add you to the group ${operators}: usermod -aG ${operators} USER. Then log in again.`
     : "Only root and the daemon's own user operate it.";
   by("question").hidden = !question;
-  by("question-text").textContent = question ?? "";
+  document.body.classList.toggle("asks", Boolean(question));
+  // The command is for a terminal; here the button does the same.
+  by("question-text").textContent = (question ?? "").replace(", then `raysweep continue`", "");
   by("answer").disabled = !question;
   by("run-name").textContent = session ? nameOf(session) : "No run yet";
   by("pause").disabled = !["armed", "running"].includes(state);
-  by("continue").disabled = state !== "paused";
+  by("continue").disabled = state !== "paused" || Boolean(question);
   by("cancel").disabled = !isUnderWay;
   for (const id of ["start", "check", "find"]) by(id).disabled = isUnderWay || !state;
   // A viewfinder stores nothing.
@@ -133,20 +138,22 @@ function draw() {
   if (status.error) notes.push(note("bad", status.error));
   if (status.ended && asked) notes.push(note("warn", asked));
   notes.push(...(status.warnings ?? []).map((warning) => note("warn", warning)));
-  if (status.ended && session && stores) {
+  if (status.ended === "complete" && session && stores) {
     const href = `session/${encodeURIComponent(nameOf(session))}/report`;
     notes.push(element("p", {}, element("a", { href, target: "_blank", rel: "noopener" }, "Open the report")));
+  } else if (status.ended && session && stores) {
+    notes.push(note("warn", "What it has stored is among the sessions, with a button that resumes it if it can be."));
   }
   by("notes").replaceChildren(...notes);
 }
 
 function tellVsync(vsync) {
-  by("vsync-card").hidden = false;
   by("vsync-text").textContent = `period ${vsync.period_us.toFixed(2)} µs, jitter ${number(vsync.jitter_us)} µs; `
     + `${vsync.edges} edges, ${vsync.missed} missed, ${vsync.false_edges} false`;
 }
 
 function addJitter(vsync) {
+  by("vsync-card").hidden = false;
   tellVsync(vsync);
   const row = [(performance.now() - opened) / 1000, vsync.jitter_us, vsync.jitter_p99_us];
   row.forEach((value, axis) => jitter[axis].push(value));

@@ -7,6 +7,10 @@ import { line, plotIn } from "./plots.js";
 const nameOf = (folder) => folder.split("/").pop();
 const address = (session, rest = "") => `session/${encodeURIComponent(session)}${rest}`;
 
+/** What the list shows of a session. */
+const shownOf = ({ name, created, kind, state, sample, operator }) =>
+  [name, `${created.slice(0, 16).replace("T", " ")} UTC`, kind, state, sample, operator].filter(Boolean);
+
 let [listed, chosen, other] = [[], null, null];
 /** Thumbnails by session, with the state of the session that they show. */
 const thumbnails = new Map();
@@ -32,21 +36,23 @@ export function startSessions({ watch }) {
 
   function drawList() {
     const wanted = by("filter").value.toLowerCase();
-    const fits = (info) => JSON.stringify([info.name, info.kind, info.state, info.operator, info.sample, info.tags,
-      info.session]).toLowerCase().includes(wanted);
+    const fits = (info) => [...shownOf(info), ...info.tags, info.session].join(" ").toLowerCase().includes(wanted)
+      // A viewfinder stores nothing to look at; who asks for them finds them.
+      && (info.kind !== "viewfinder" || (wanted && "viewfinder".includes(wanted)));
     by("sessions").replaceChildren(...listed.filter(fits).map((info) => {
       const name = nameOf(info.session);
-      const when = info.created.slice(0, 16).replace("T", " ");
       const show = (one, two) => {
         [chosen, other] = [one, two];
         drawList();
         showSessions();
+        // Below the list on a narrow page, where it would go unseen.
+        if (matchMedia("(max-width: 760px)").matches) by("session").scrollIntoView();
       };
       return element("li", {},
         element("button", { class: "choose", type: "button", "aria-pressed": String(name === chosen), title: name,
           onclick: () => show(name, null) },
         thumbnail(info), element("span", {}, info.name || name),
-        element("span", { class: "quiet" }, `${when} UTC · ${info.kind} · ${info.state}`)),
+        element("span", { class: "quiet" }, shownOf(info).slice(1).join(" · "))),
         element("button", { type: "button", "aria-pressed": String(name === other),
           disabled: !chosen || chosen === name,
           onclick: () => show(chosen, other === name ? null : name) }, "compare"));
@@ -125,7 +131,9 @@ async function pictures(sides, name, onpixel) {
   const of = (session) => fetchPicture(address(session, `/picture/${encodeURIComponent(name)}`));
   const [one, two] = await Promise.all([of(chosen), other && of(other)]);
   sides.replaceChildren();
-  const side = (title, picture, options = {}) => {
+  // In two pictures side by side, the same light has the same brightness.
+  const range = two && Float32Array.from([...one.values, ...two.values]);
+  const side = (title, picture, options = { range }) => {
     const box = element("div", {}, element("h3", {}, title));
     sides.append(box);
     const view = new Picture(box, { label: `${name} of ${title}`, onpixel, ...options });
