@@ -118,11 +118,12 @@ mod tests {
         let (created, mut ledger) =
             Session::create(data.path(), entry, "kind = \"sweep\"", PERMITTED).unwrap();
         let listed = [session(created.dir(), "unfinished", PERMITTED, "kind = \"sweep\"")];
+        let run = |resumed| Entry::Run { started: "2026-03-04T05:06:08Z".parse().unwrap(), resumed };
         for resumed in [false, true, true] {
-            ledger.append(&Entry::Run { started: jiff::Timestamp::now(), resumed }).unwrap();
+            ledger.append(&run(resumed)).unwrap();
             assert!(cut_off(&listed).unwrap().is_ok());
         }
-        ledger.append(&Entry::Run { started: jiff::Timestamp::now(), resumed: true }).unwrap();
+        ledger.append(&run(true)).unwrap();
         assert!(cut_off(&listed).unwrap().unwrap_err().contains("3 times"));
     }
 
