@@ -39,7 +39,9 @@ pub(super) fn session(folder: &Path) -> Result<Value, String> {
 /// The report.
 pub(super) fn report(folder: &Path) -> Result<Vec<u8>, String> {
     let path = Session::open(folder).map_err(told)?.report_path();
-    let file = File::open(&path).map_err(|_none| "this session has no report: `raysweep process` makes one of what is stored".to_owned())?;
+    let file = File::open(&path).map_err(|_none| {
+        "this session has no report: `raysweep process` makes one of what is stored".to_owned()
+    })?;
     let mut page = Vec::new();
     file.take(MOST_REPORT_BYTES).read_to_end(&mut page).map_err(told)?;
     Ok(page)
