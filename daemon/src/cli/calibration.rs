@@ -104,7 +104,7 @@ fn figures(header: &CalibrationHeader) -> [(&'static str, Pair); 8] {
         ("projector row time / us", timing.row_time_us),
         ("camera row time / us", timing.camera_row_time_us),
         ("exposure offset / us", timing.exposure_offset_us),
-        ("jitter / us", timing.jitter_us),
+        ("jitter of the light against the VSYNC edge / us", timing.jitter_us),
         ("white / DN", light.white_dn),
         ("gain / (e/DN)", light.electrons_per_dn),
         ("read noise / e", light.read_noise_e),
@@ -125,15 +125,33 @@ fn header(header: &CalibrationHeader) -> String {
         valid_for.projector_rows,
         end.saturating_sub(1),
     );
-    for (name, [value, sd]) in figures(header) {
+    for (name, pair) in figures(header) {
         // Writing to a string does not fail.
-        let _ = writeln!(text, "{name:24} {value:12.5} +- {sd:.5}");
+        let _ = writeln!(text, "{name:NAME_WIDTH$} {}", with_error(pair));
     }
-    let _ = write!(text, "{:24} {:12} +- {:.3}", "latency / us", "", header.timing.latency_sd_us);
+    let [_, latency_sd] = rounded([0.0, header.timing.latency_sd_us]);
+    let _ = write!(text, "{:NAME_WIDTH$} known to {latency_sd} us", "latency");
     for (name, said) in header.ambient.iter().flat_map(CalibratedAmbient::lines) {
-        let _ = write!(text, "\n{name:24} {said}");
+        let _ = write!(text, "\n{name:NAME_WIDTH$} {said}");
     }
     text
+}
+
+/// Width of the column of names: that of the longest.
+const NAME_WIDTH: usize = 46;
+
+/// A value with its standard deviation.
+fn with_error(pair: Pair) -> String {
+    let [value, sd] = rounded(pair);
+    format!("{value} +- {sd}")
+}
+
+/// A value and its standard deviation, both up to the second digit of the latter.
+fn rounded([value, sd]: Pair) -> [String; 2] {
+    // Of a deviation that is not known, no digit tells anything; five of the value are enough.
+    let is_known = sd > 0.0 && sd.is_finite();
+    let decimals = if is_known { (1.0 - sd.log10().floor()).clamp(0.0, 12.0) as usize } else { 5 };
+    [value, sd].map(|number| format!("{number:.decimals$}"))
 }
 
 /// Two calibrations of the same rig.
@@ -189,9 +207,9 @@ impl Comparison {
 
 impl std::fmt::Display for Comparison {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        writeln!(f, "{:24} {:>12} {:>12} {:>12}", "", "first", "second", "difference")?;
+        writeln!(f, "{:NAME_WIDTH$} {:>12} {:>12} {:>12}", "", "first", "second", "difference")?;
         for (name, first, second, sds) in &self.figures {
-            writeln!(f, "{name:24} {first:12.5} {second:12.5} {sds:9.1} sd")?;
+            writeln!(f, "{name:NAME_WIDTH$} {first:12.5} {second:12.5} {sds:9.1} sd")?;
         }
         let [mean_us, most_us] = self.rows_us;
         writeln!(
@@ -199,5 +217,18 @@ impl std::fmt::Display for Comparison {
             "rows are lit {mean_us:.3} us later on average; beside that, they differ by at most {most_us:.3} us"
         )?;
         write!(f, "places differ by {:.4} rows (root mean square)", self.place_rows)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_end_at_the_second_digit_of_their_errors() {
+        assert_eq!(with_error([22.300_123_4, 0.000_123_4]), "22.30012 +- 0.00012");
+        assert_eq!(with_error([2_503.456, 1.234]), "2503.5 +- 1.2");
+        assert_eq!(with_error([2_503.456, 123.4]), "2503 +- 123");
+        assert_eq!(with_error([0.25, 0.0]), "0.25000 +- 0.00000");
     }
 }

@@ -41,6 +41,8 @@ pub(super) enum CommandFailure {
     #[error("{0}")]
     Sessions(String),
     #[error("{0}")]
+    Trash(String),
+    #[error("{0}")]
     Setup(String),
     #[error("{0}")]
     Exposure(String),
@@ -165,6 +167,7 @@ impl CommandFailure {
             | Self::Live(_)
             | Self::Rig(_)
             | Self::Exposure(_)
+            | Self::Trash(_)
             | Self::Process(_)
             | Self::Park(_)
             | Self::Signals(_)

@@ -25,7 +25,7 @@ mod view;
 mod viewfinder;
 mod watch;
 
-use std::ffi::OsString;
+use std::ffi::{OsStr, OsString};
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -231,7 +231,7 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             }
         }
         Command::Restore { session } => {
-            let trashed = Session::open(&trashed_folder_of(session, &socket));
+            let trashed = Session::open(&trashed_folder_of(session, &socket)?);
             let to = trashed.and_then(|session| session.restore()).map_err(ProcessError::from)?;
             printer.print(&json!({ "moved_to": to }), |_| format!("moved to {}", to.display()))?;
         }
@@ -363,13 +363,49 @@ fn folder_of(given: PathBuf, socket: &Path) -> PathBuf {
 }
 
 /// The folder of a session in the trash, which is given by its folder, or by its name if the daemon answers.
-fn trashed_folder_of(given: PathBuf, socket: &Path) -> PathBuf {
-    if given.exists() || given.components().count() != 1 {
-        return given;
+fn trashed_folder_of(given: PathBuf, socket: &Path) -> Result<PathBuf, CommandFailure> {
+    if given.exists() {
+        return Ok(given);
     }
-    let data =
-        Client::connect(socket).and_then(|mut client| client.status()).ok().and_then(|status| status.data);
-    data.map_or(given.clone(), |data| data.join(TRASH).join(given))
+    let trash = match given.parent() {
+        Some(folder) if folder.file_name() == Some(TRASH.as_ref()) => folder.to_owned(),
+        // `raysweep sessions` lists no trash, so that an error about a folder of that name would lead nowhere.
+        Some(folder) if folder.as_os_str().is_empty() => {
+            let status = Client::connect(socket).and_then(|mut client| client.status());
+            let data = status.ok().and_then(|status| status.data).ok_or_else(|| {
+                let name = given.display();
+                let why = "no daemon answers that could look it up in its trash; give its folder in .trash";
+                CommandFailure::Trash(format!("there is no folder {name} here, and {why}"))
+            })?;
+            data.join(TRASH)
+        }
+        _ => return Ok(given),
+    };
+    let name = given.file_name().unwrap_or_default();
+    let folder = trash.join(name);
+    if folder.exists() { Ok(folder) } else { Err(CommandFailure::Trash(not_in_trash(&trash, name))) }
+}
+
+/// Most names of sessions in the trash that are listed.
+const LISTED: usize = 10;
+
+/// Says what is in the trash instead, the newest first.
+fn not_in_trash(trash: &Path, name: &OsStr) -> String {
+    let missing = format!("there is no {} in the trash", name.display());
+    let mut names: Vec<String> = match fs::read_dir(trash) {
+        Ok(entries) => entries.flatten().map(|entry| entry.file_name().display().to_string()).collect(),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Vec::new(),
+        Err(error) => return format!("{missing}, or {} cannot be read: {error}", trash.display()),
+    };
+    // Names begin with the time at which the run began.
+    names.sort_by(|a, b| b.cmp(a));
+    let more = names.len().saturating_sub(LISTED);
+    names.truncate(LISTED);
+    match (names.as_slice(), more) {
+        ([], _) => format!("{missing}: it is empty"),
+        (names, 0) => format!("{missing}; it holds: {}", names.join(", ")),
+        (names, more) => format!("{missing}; it holds: {}, and {more} older ones", names.join(", ")),
+    }
 }
 
 const STACK_WITH_FORMAT: &str =

@@ -223,10 +223,12 @@ fn advice(advice: &PlanAdvice) -> Vec<(&'static str, String)> {
         }
     };
     let (dark, shot) = (short(noise.dark), short(noise.shot));
+    let planned = expected;
     let better = better.as_ref().map_or_else(
         || "no better settings of this length found".into(),
         |BetterPlan { points, frames, expected, .. }| {
-            format!("{}, with {points} settings and {frames} frames; see below", range(&expected.total))
+            let (found, for_which) = (range(&expected.total), better_for(&planned.total, &expected.total));
+            format!("{for_which}{found}, with {points} settings and {frames} frames; see below")
         },
     );
     vec![
@@ -234,6 +236,19 @@ fn advice(advice: &PlanAdvice) -> Vec<(&'static str, String)> {
         ("error", format!("{}, expected with the prior {prior}", errors(expected))),
         ("better", better),
     ]
+}
+
+/// For which scenes the proposed settings are better, if not for both those that count: proposals are ranked by the
+/// errors of a typical and of a hard scene together, so one of them may even be larger.
+fn better_for(planned: &ErrorRange, proposed: &ErrorRange) -> &'static str {
+    // As printed: what looks the same is not better.
+    let is_smaller =
+        |of: fn(&ErrorRange) -> f64| of(proposed) < of(planned) && short(of(proposed)) != short(of(planned));
+    match (is_smaller(|range| range.median), is_smaller(|range| range.high)) {
+        (false, true) => "for the hardest scenes: ",
+        (true, false) => "for typical scenes: ",
+        _ => "",
+    }
 }
 
 /// Text of `design`: a plan file, with what is expected of it as comments.
@@ -459,6 +474,20 @@ pub(super) fn block(rows: &[(&str, String)]) -> String {
 mod tests {
 
     use super::*;
+
+    #[test]
+    fn a_proposal_says_for_which_scenes_it_is_better() {
+        let range = |median, high| ErrorRange { low: 0.01, median, high };
+        let planned = range(0.040, 0.44);
+        assert_eq!(better_for(&planned, &range(0.046, 0.13)), "for the hardest scenes: ");
+        assert_eq!(
+            better_for(&planned, &range(0.0399, 0.13)),
+            "for the hardest scenes: ",
+            "printed as 0.040"
+        );
+        assert_eq!(better_for(&planned, &range(0.030, 0.50)), "for typical scenes: ");
+        assert_eq!(better_for(&planned, &range(0.030, 0.13)), "");
+    }
 
     #[test]
     fn no_time_is_too_strange_to_be_told() {

@@ -33,8 +33,8 @@ pub(super) struct EventView {
     vsync: Option<VsyncStats>,
     /// Points in the newest live estimate.
     live: Option<usize>,
-    /// What a viewfinder has said of the rows, how often, and of its problem.
-    said: (u64, Option<String>),
+    /// What a viewfinder has advised last of the rows, and its problem.
+    said: (Option<Vec<String>>, Option<String>),
 }
 
 /// Where the events are displayed.
@@ -61,7 +61,7 @@ impl EventView {
             frames: None,
             vsync: None,
             live: None,
-            said: (0, None),
+            said: (None, None),
         }
     }
 
@@ -150,9 +150,11 @@ impl EventView {
     }
 
     fn viewfinder(&mut self, values: &ViewfinderValues) {
-        if let Some(alignment) = values.alignment.as_ref().filter(|found| found.measured != self.said.0) {
-            self.said.0 = alignment.measured;
-            self.remark(&finder_text::alignment(alignment));
+        // The rows are measured again and again; what has been advised already is not repeated.
+        let advice = values.alignment.as_ref().map(|found| &found.advice);
+        if advice != self.said.0.as_ref() {
+            self.said.0 = advice.cloned();
+            values.alignment.iter().for_each(|found| self.remark(&finder_text::alignment(found)));
         }
         if values.problem != self.said.1 {
             self.said.1.clone_from(&values.problem);

@@ -139,7 +139,11 @@ fn a_session_in_the_trash_is_restored_by_its_name() {
         let refused = by_name(socket, name);
         let said = String::from_utf8_lossy(&refused.stderr).into_owned();
         assert!(refused.status.code() == Some(1) && said.contains(name) && !session.exists(), "{said}");
+        assert!(!said.contains("`raysweep sessions`"), "which does not list the trash: {said}");
     }
+    let refused = by_name(&daemon.path, "20260102-000000_sweep");
+    let said = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert!(said.contains("in the trash; it holds: 20260101-000000_sweep"), "{said}");
     let restored = by_name(&daemon.path, "20260101-000000_sweep");
     let said = String::from_utf8_lossy(&restored.stdout).into_owned();
     assert!(restored.status.success() && said.contains(text(&session)) && session.exists(), "{said}");

@@ -22,15 +22,16 @@ use super::exit::Exit;
 use super::failure::CommandFailure;
 use super::printer::Printer;
 
-/// A first sweep: few points, so that something is seen soon.
+/// A first sweep: the paper's settings with few frames each, so that something is seen soon. Fewer settings do not tell
+/// the pixel's own row from the rows beside it, and reach less of the light.
 const FIRST_SWEEP: &str = "\
-# A first look, written by `raysweep setup`: 7 delays, 2 exposures, 2 frames each.
+# A first look, written by `raysweep setup`: 15 delays, 5 exposures, 2 frames each.
 kind = \"sweep\"
 name = \"first look\"
 
 [sweep]
-delay_us = { start = -900, stop = 900, count = 7 }
-exposure_us = [400, 800]
+delay_us = { start = -1500, stop = 1500, count = 15 }
+exposure_us = { start = 600, stop = 1200, count = 5 }
 average = 2
 ";
 

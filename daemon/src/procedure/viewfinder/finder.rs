@@ -173,7 +173,12 @@ impl Finder {
         let Levels { saturated, underexposed, mean_dn, brightest_dn, histogram } =
             Levels::of(region, &self.scale);
         let step = if self.format.mosaic == Mosaic::Mono { 1 } else { 2 };
-        let focus = self.focus.add(region, &self.scale, step);
+        // Under black there is nothing to focus on, and the pictures of `align` differ from each other: a score would
+        // compare stripes with their inverse.
+        let focus = match values.picture {
+            FinderPicture::Black | FinderPicture::Align => None,
+            _ => self.focus.add(region, &self.scale, step),
+        };
         let (rows, columns) = region.dim();
         values.pictures += 1;
         (values.saturated, values.underexposed) = (saturated, underexposed);
