@@ -35,19 +35,22 @@ pub(super) fn by_hand(
     let text = plan.map(read_plan).transpose()?;
     let without_plan =
         || -> Result<_, CommandFailure> { Ok(examine(&AnyRig::load(rig)?.into(), data, None, &|| true)) };
-    let opened = match plan {
-        Some(plan) => Runner::new(AnyRig::load(rig)?, data.to_owned()).inspect_err(|_| {
-            eprintln!(
-                "{}: not examined, because its needs depend on devices that cannot be opened",
-                plan.display()
-            );
-        }),
-        None => return print(&without_plan()?, printer),
-    };
+    let Some(plan) = plan else { return print(&without_plan()?, printer) };
+    let loaded = AnyRig::load(rig)?;
+    if matches!(loaded, AnyRig::Dots(_)) {
+        let shown = plan.display();
+        eprintln!(
+            "{shown}: not examined: opening a mirror may move it; `raysweep doctor {shown}` asks the daemon"
+        );
+        return print(&without_plan()?, printer);
+    }
+    let opened = Runner::new(loaded, data.to_owned()).inspect_err(|error| {
+        eprintln!("{}: not examined, because its needs depend on devices: {error}", plan.display());
+    });
     let report = match opened {
         Ok(runner) => {
             let examined = runner.doctor(&DoctorParams { plan: text.clone() }).map_err(ClientError::Rpc);
-            examined.map_err(|error| of_plan(error, plan, text.as_deref()))?
+            examined.map_err(|error| of_plan(error, Some(plan), text.as_deref()))?
         }
         Err(_) => without_plan()?,
     };

@@ -299,13 +299,15 @@ impl Rig {
     }
 
     /// Opens all devices to see that they are there. A missing watcher of the VSYNC is only logged: without it, the rig
-    /// can still be focused.
+    /// can still be focused. A service that resumes by itself waits for it: the sweep that was cut off needs it.
     ///
     /// # Errors
     /// The other devices that cannot be opened.
     pub fn look_for_camera(&self) -> Result<CameraCapabilities, RigError> {
         let mut each = self.open_each()?;
-        if let Err(RigError::Device(error)) = &each.vsync {
+        if let Err(RigError::Device(error)) = &each.vsync
+            && !self.file.auto_resume
+        {
             tracing::warn!(%error, "until it can be opened, nothing runs but `raysweep viewfinder --trigger none`");
             each.vsync = Ok(Box::new(Unwatched));
         }

@@ -4,7 +4,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use raysweep_config::plan::ViewfinderPlan;
 use raysweep_core::{
-    CameraSettings, FinderPicture, FramePool, MirrorPath, PathError, SettingsId, Shutter, Tilt,
+    CameraSettings, DeviceErrorKind, FinderPicture, FramePool, MirrorPath, PathError, SettingsId, Shutter,
+    Tilt,
 };
 use raysweep_pipeline::dots::Arrival;
 use raysweep_processing::viewfinder::{CountScale, EXPOSED_SHARE, saturation_dn};
@@ -102,9 +103,13 @@ fn watch(
             finder.complain("a dot rig has no rows to align");
         }
         if let Some(exposure_us) = wanted.exposure_us {
-            settings.exposure_us = exposure_us;
+            let wanted = CameraSettings { exposure_us, ..*settings };
             writes += 1;
-            player.camera.configure(SettingsId { point: 0, attempt: writes }, settings)?;
+            match player.camera.configure(SettingsId { point: 0, attempt: writes }, &wanted) {
+                Ok(_) => *settings = wanted,
+                Err(error) if error.kind == DeviceErrorKind::OutOfRange => finder.complain(error.to_string()),
+                Err(error) => return Err(error.into()),
+            }
         }
         let path = path(rig, plan, finder.picture()).map_err(|error| RunError::Frame(error.to_string()))?;
         let enough = AtomicBool::new(false);

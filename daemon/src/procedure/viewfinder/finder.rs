@@ -143,6 +143,11 @@ impl Finder {
         }
     }
 
+    /// Takes back a complaint, with the next picture.
+    pub fn is_mended(&mut self, problem: &str) {
+        self.values.problem.take_if(|told| told == problem);
+    }
+
     /// Tells how the rows lie from now on, with the next picture.
     pub fn align(&mut self, alignment: Result<RowAlignment, String>) {
         match alignment {

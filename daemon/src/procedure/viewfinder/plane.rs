@@ -113,6 +113,10 @@ impl Viewer<'_> {
     }
 
     fn frames(&mut self) -> Result<(), RunError> {
+        let (complaint, frame) = match self.task.free_hz() {
+            None => (NO_TRIGGER, Duration::ZERO),
+            Some(free_hz) => (NO_FRAMES, Duration::from_secs_f64(1.0 / free_hz)),
+        };
         let mut waiting = Instant::now();
         while self.orders.go_on() && !self.finder.is_over() {
             self.orders.wait_while_paused();
@@ -120,12 +124,10 @@ impl Viewer<'_> {
             match self.camera.next_frame(&mut self.buffer, POLL)? {
                 Some(stamp) => {
                     waiting = Instant::now();
+                    self.finder.is_mended(complaint);
                     self.frame(&stamp)?;
                 }
-                None if waiting.elapsed() > PATIENCE => self.finder.complain(match self.task.free_hz() {
-                    None => NO_TRIGGER,
-                    Some(_) => NO_FRAMES,
-                }),
+                None if waiting.elapsed() > PATIENCE + 2 * frame => self.finder.complain(complaint),
                 None => {}
             }
         }

@@ -8,6 +8,9 @@ import { Picture, element, fetchPicture, number } from "./picture.js";
 
 const UNDER_WAY = ["preparing", "armed", "running", "paused", "draining"];
 
+/** Nobody ends a viewfinder whose tab was closed: it ends by itself, with its light, after an hour. */
+const FINDER = "kind = \"viewfinder\"\n[viewfinder]\nseconds = 3600\n";
+
 const clock = (seconds) => {
   if (!Number.isFinite(seconds)) return "unknown";
   const whole = Math.round(seconds);
@@ -41,7 +44,7 @@ export function startRun() {
   });
   by("check").addEventListener("click", check);
   by("start").addEventListener("click", () => start(by("plan").value));
-  by("find").addEventListener("click", () => start("kind = \"viewfinder\"\n"));
+  by("find").addEventListener("click", () => start(FINDER));
   watchPictures(startFinder(order));
   setInterval(() => { if (!document.hidden) refresh(); }, 2000);
   return hear;
@@ -231,6 +234,9 @@ async function watchPictures({ onregion, onmarks }) {
   const look = async () => {
     const answer = await fetch("live");
     const found = answer.ok ? await answer.json() : {};
+    // A daemon that was started again counts from 1.
+    if ((found[chosen] ?? 0) < sequence) sequence = 0;
+    by("live-none").hidden = answer.ok && shown !== null;
     by("live-none").textContent = answer.ok
       ? "No live picture yet. A run publishes its first after some points." : await answer.text();
     if (Object.keys(found).join() === Object.keys(names).join()) return;

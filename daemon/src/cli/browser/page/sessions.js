@@ -66,7 +66,11 @@ export function startSessions({ watch }) {
     const known = thumbnails.get(session);
     if (known?.shows === shows) return known.image;
     const src = mayRead ? address(nameOf(session), "/thumbnail") : null;
-    const image = element("img", { src, alt: "", loading: "lazy", onerror: () => { image.className = "none"; } });
+    const image = element("img", { src, alt: "", loading: "lazy", onerror: () => {
+      image.className = "none";
+      // It is asked for again with the next list.
+      thumbnails.delete(session);
+    } });
     if (!mayRead) image.className = "none";
     thumbnails.set(session, { image, shows });
     return image;
@@ -74,8 +78,11 @@ export function startSessions({ watch }) {
 
   async function showSessions() {
     const place = by("session");
+    const [first, second] = [chosen, other];
     try {
-      const [one, two] = await Promise.all([about(chosen), other && about(other)]);
+      const [one, two] = await Promise.all([about(first), second && about(second)]);
+      // Others were chosen meanwhile.
+      if (first !== chosen || second !== other) return;
       const images = two ? one.images.filter((name) => two.images.includes(name)) : one.images;
       const menu = element("select", { "aria-label": "Picture" }, ...images.map((name) => element("option", {}, name)));
       const sides = element("div", { class: "sides" });
@@ -84,13 +91,14 @@ export function startSessions({ watch }) {
         element("a", { href: address(session, "/report"), target: "_blank", rel: "noopener" }, text);
       place.replaceChildren(
         element("div", { class: "bar" }, element("h2", {}, two ? "Two sessions" : one.name),
-          images.length ? menu : null, one.report ? link(chosen, two ? "report of the first" : "report") : null,
-          two?.report ? link(other, "report of the second") : null,
-          !two && one.can_resume ? resume(chosen, place) : null),
+          images.length ? menu : null, one.report ? link(first, two ? "report of the first" : "report") : null,
+          two?.report ? link(second, "report of the second") : null,
+          !two && one.can_resume ? resume(first, place) : null),
         ...(two ? [] : [figures(one)]), sides, plot);
       const pixel = profile(plot, [one, two].filter(Boolean));
-      menu.addEventListener("change", () => pictures(sides, menu.value, pixel));
-      if (images.length) await pictures(sides, menu.value, pixel);
+      const draw = () => pictures(sides, [first, second], menu, pixel);
+      menu.addEventListener("change", draw);
+      if (images.length) await draw();
       else sides.replaceChildren(element("p", { class: "empty" },
         two ? "The two have no picture in common." : "This session has no pictures."));
     } catch (error) {
@@ -127,9 +135,12 @@ function figures(session) {
     .flatMap(([key, value]) => [element("dt", {}, key), element("dd", {}, value)]));
 }
 
-async function pictures(sides, name, onpixel) {
+async function pictures(sides, [first, second], menu, onpixel) {
+  const name = menu.value;
   const of = (session) => fetchPicture(address(session, `/picture/${encodeURIComponent(name)}`));
-  const [one, two] = await Promise.all([of(chosen), other && of(other)]);
+  const [one, two] = await Promise.all([of(first), second && of(second)]);
+  // Another picture was chosen meanwhile.
+  if (name !== menu.value) return;
   sides.replaceChildren();
   // In two pictures side by side, the same light has the same brightness.
   const range = two && Float32Array.from([...one.values, ...two.values]);
@@ -139,9 +150,9 @@ async function pictures(sides, name, onpixel) {
     const view = new Picture(box, { label: `${name} of ${title}`, onpixel, ...options });
     view.show(picture);
   };
-  side(other ? chosen : name, one);
+  side(second ? first : name, one);
   if (!two) return;
-  side(other, two);
+  side(second, two);
   if (one.shape.join() !== two.shape.join()) {
     sides.append(note("warn", "The pictures differ in size, so there is no difference to show."));
     return;
