@@ -63,7 +63,8 @@ impl View {
             .with_live(live)
             .with_probes(Probes { devices: Some(Arc::new(devices)), ..Probes::default() });
         let events = runner.events();
-        let plan = format!("kind = \"viewfinder\"\n[viewfinder]\npictures_per_s = 30\n{plan}");
+        // Out of step with the projector, so that a camera that runs freely begins its frames anywhere in a period.
+        let plan = format!("kind = \"viewfinder\"\n[viewfinder]\npictures_per_s = 29\n{plan}");
         runner.run(RunParams { plan, ..RunParams::default() }).unwrap();
         Self { runner, events, folder, told, lenses, truth }
     }
@@ -238,10 +239,13 @@ fn a_camera_that_runs_freely_needs_neither_an_edge_nor_a_watcher() {
     for rig in [without_edges, without_watcher] {
         let mut view = View::new(&rig, "trigger = \"none\"\nsubject = \"board\"\n");
         // An exposure of a whole period sees all light of each row, wherever it begins: no row is darker than another.
-        let values = view.picture(|values| values.pictures == 3);
-        assert!((values.mean_dn / 2564.0 - 1.0).abs() < 0.02, "{}", values.mean_dn);
-        assert!(values.column_cut.iter().all(|dn| (2000.0..3200.0).contains(dn)), "{:?}", values.column_cut);
-        assert_eq!(values.problem, None);
+        for _ in 0..15 {
+            let values = view.picture(|values| values.pictures > 2);
+            assert!((values.mean_dn / 2564.0 - 1.0).abs() < 0.02, "{}", values.mean_dn);
+            let cut = &values.column_cut;
+            assert!(cut.iter().all(|dn| (2000.0..3200.0).contains(dn)), "{cut:?}");
+            assert_eq!(values.problem, None);
+        }
         view.show(FinderPicture::Align);
         let problem = view.picture(|values| values.problem.is_some()).problem.unwrap();
         assert!(problem.contains("needs trigger = \"vsync\""), "{problem}");
