@@ -61,6 +61,9 @@ pub trait Control: Send + Sync + 'static {
     /// `NotRunning`.
     fn cancel(&self) -> Result<(), RpcError>;
 
+    /// Ends the run of this session cleanly, if it is in progress: the client that it was attached to has gone.
+    fn abandon(&self, session: &Path);
+
     /// Permits a mirror's light until the next boot.
     ///
     /// # Errors

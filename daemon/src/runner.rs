@@ -78,7 +78,13 @@ struct Start<'a> {
 struct Current {
     orders: Arc<Orders>,
     /// `None` while the run is being prepared.
-    thread: Option<JoinHandle<()>>,
+    begun: Option<Begun>,
+}
+
+/// A run that has begun.
+struct Begun {
+    session: PathBuf,
+    thread: JoinHandle<()>,
 }
 
 impl Runner {
@@ -165,14 +171,14 @@ impl Runner {
             orders.give(Order::Cancel);
         }
         let in_preparation =
-            |current: &mut Option<Current>| matches!(current, Some(Current { thread: None, .. }));
+            |current: &mut Option<Current>| matches!(current, Some(Current { begun: None, .. }));
         (current, _) = self
             .prepared
             .wait_timeout_while(current, MOST_PREPARING, in_preparation)
             .unwrap_or_else(PoisonError::into_inner);
-        let thread = current.take().and_then(|current| current.thread);
+        let begun = current.take().and_then(|current| current.begun);
         drop(current);
-        if thread.is_some_and(|thread| thread.join().is_err()) {
+        if begun.is_some_and(|begun| begun.thread.join().is_err()) {
             tracing::error!("the run's thread panicked");
         }
     }
@@ -216,16 +222,18 @@ impl Runner {
     /// Reserves the daemon for a run, prepares it and starts its thread.
     fn start(
         &self,
-        begin: impl FnOnce(&Arc<Orders>) -> Result<(Started, JoinHandle<()>), RpcError>,
+        begin: impl FnOnce(&Arc<Orders>) -> Result<Begun, RpcError>,
     ) -> Result<Started, RpcError> {
-        self.reserved(|orders| begin(orders).map(|(started, thread)| (started, Some(thread))))
+        self.reserved(|orders| {
+            begin(orders).map(|begun| (Started { session: begun.session.clone() }, Some(begun)))
+        })
     }
 
     /// Reserves the daemon while `begin` works; unless that has started a run's thread, the daemon is then free again.
     /// Meanwhile, orders can be given.
     fn reserved<T>(
         &self,
-        begin: impl FnOnce(&Arc<Orders>) -> Result<(T, Option<JoinHandle<()>>), RpcError>,
+        begin: impl FnOnce(&Arc<Orders>) -> Result<(T, Option<Begun>), RpcError>,
     ) -> Result<T, RpcError> {
         let orders = Arc::new(Orders::default());
         let last = {
@@ -237,28 +245,28 @@ impl Runner {
                 ));
             }
             self.board.go(RunState::Preparing).map_err(wrong_state)?;
-            current.replace(Current { orders: orders.clone(), thread: None })
+            current.replace(Current { orders: orders.clone(), begun: None })
         };
-        if let Some(thread) = last.and_then(|last| last.thread) {
+        if let Some(Begun { thread, .. }) = last.and_then(|last| last.begun) {
             // The thread of the last run had nothing left to do once the state allowed a new run.
             let _ = thread.join();
         }
-        let begun = catch_unwind(AssertUnwindSafe(|| begin(&orders))).unwrap_or_else(|panic| {
+        let outcome = catch_unwind(AssertUnwindSafe(|| begin(&orders))).unwrap_or_else(|panic| {
             let what = format!("preparing the run failed because of a bug: {}", message_of(&*panic));
             Err(RpcError::new(ErrorCode::Internal, what))
         });
         let mut current = self.lock();
-        let (result, thread) = match begun {
-            Ok((result, thread)) => (Ok(result), thread),
+        let (result, begun) = match outcome {
+            Ok((result, begun)) => (Ok(result), begun),
             Err(error) => (Err(error), None),
         };
-        if thread.is_none() {
+        if begun.is_none() {
             // No run has begun, so none has failed.
             let _ = self.board.go(RunState::Idle);
         }
         // There is no current run if the daemon did not wait for the preparation before it shut down.
-        match (&mut *current, thread) {
-            (Some(current), Some(thread)) => current.thread = Some(thread),
+        match (&mut *current, begun) {
+            (Some(current), begun @ Some(_)) => current.begun = begun,
             (_, None) => *current = None,
             (None, Some(_cancelled)) => {}
         }
@@ -273,7 +281,7 @@ impl Runner {
         session: Session,
         ledger: Ledger,
         start: Start<'_>,
-    ) -> Result<(Started, JoinHandle<()>), RpcError> {
+    ) -> Result<Begun, RpcError> {
         let Start { orders, is_resumed } = start;
         let dir = session.dir().to_owned();
         self.board.set_session(dir.clone());
@@ -294,7 +302,7 @@ impl Runner {
             .map_err(|error| {
                 RpcError::new(ErrorCode::Internal, format!("cannot start the run's thread: {error}"))
             })?;
-        Ok((Started { session: dir }, thread))
+        Ok(Begun { session: dir, thread })
     }
 
     fn outlet(&self, dir: &Path) -> Option<Outlet> {
@@ -334,7 +342,7 @@ impl Runner {
         Ok(())
     }
 
-    fn begin(&self, params: &RunParams, orders: &Arc<Orders>) -> Result<(Started, JoinHandle<()>), RpcError> {
+    fn begin(&self, params: &RunParams, orders: &Arc<Orders>) -> Result<Begun, RpcError> {
         let foreseen = self.foresee(&params.plan)?;
         self.check_needs(&foreseen.report, foreseen.instead, 0)?;
         self.go_on_preparing(orders)?;
@@ -386,7 +394,7 @@ impl Runner {
         &self,
         params: &ResumeParams,
         orders: &Arc<Orders>,
-    ) -> Result<(Started, JoinHandle<()>), RpcError> {
+    ) -> Result<Begun, RpcError> {
         let session = self.session(&params.session)?;
         let read = |path: PathBuf| {
             let folders = std::slice::from_ref(&self.data);
@@ -509,6 +517,15 @@ impl Control for Runner {
         let during =
             [RunState::Preparing, RunState::Armed, RunState::Running, RunState::Paused, RunState::Draining];
         self.order(Order::Cancel, &during, None)
+    }
+
+    fn abandon(&self, session: &Path) {
+        let current = self.lock();
+        let is_it = |current: &&Current| current.begun.as_ref().is_some_and(|begun| begun.session == session);
+        if let Some(current) = current.as_ref().filter(is_it) {
+            // Nothing happens if the run is over.
+            current.orders.give(Order::Cancel);
+        }
     }
 
     fn arm_light(&self) -> Result<(), RpcError> {

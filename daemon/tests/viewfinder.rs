@@ -473,3 +473,21 @@ fn a_viewfinder_ends_with_its_client_however_that_ends() {
         assert_eq!(client.status().unwrap().state, RunState::Idle, "{signal}");
     }
 }
+
+#[test]
+fn a_viewfinder_ends_when_its_client_is_killed_unless_it_was_detached() {
+    let program = Program::start(PLANE);
+    let mut client = Client::connect(program.folder.path().join("socket")).unwrap();
+    let mut command = program.command(&["viewfinder"]);
+    let mut viewfinder = process::Process::start(command.stdout(Stdio::null()).stderr(Stdio::null()));
+    process::wait_for("a picture", || client.status().unwrap().viewfinder);
+    viewfinder.signal(Signal::SIGKILL);
+    viewfinder.wait();
+    process::wait_for("its end", || (client.status().unwrap().state == RunState::Idle).then_some(()));
+    assert!(program.raysweep(&["viewfinder", "--detach"]).status.success());
+    // Its second picture comes long after its client has gone.
+    let pictures = |client: &mut Client| client.status().unwrap().viewfinder.map_or(0, |seen| seen.pictures);
+    let first = pictures(&mut client);
+    process::wait_for("pictures", || (pictures(&mut client) > first + 3).then_some(()));
+    client.cancel().unwrap();
+}

@@ -310,6 +310,10 @@ pub struct RunParams {
     /// Labels for finding the session.
     #[serde(default)]
     pub tags: Vec<String>,
+    /// Whether the run is cancelled when the connection over which this came is closed, however that happens: for runs
+    /// that are of no use without their client, and would leave the light on.
+    #[serde(default)]
+    pub attached: bool,
 }
 
 /// Parameters of `resume`.

@@ -155,7 +155,7 @@ impl Trial {
         let events = Client::connect(socket)?.subscribe()?;
         let interrupts = Interrupts::of_any_end().map_err(CommandFailure::Signals)?;
         let mut client = Client::connect(socket)?;
-        client.run(&RunParams { plan: VIEWFINDER.into(), ..RunParams::default() })?;
+        client.run(&RunParams { plan: VIEWFINDER.into(), attached: true, ..RunParams::default() })?;
         let mut trial = Self { client, events, interrupts, pictures: 0 };
         trial.picture(None)?;
         Ok(trial)

@@ -101,25 +101,18 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             printer.print(&report, show::design)?;
         }
         Command::Run(RunArguments { plan, about }) => {
-            return run(&socket, printer, &plan, &read_plan(&plan)?, about, Interrupts::of_operator);
+            return run(&socket, printer, &plan, &read_plan(&plan)?, about, WithoutClient::GoesOn);
         }
         Command::Calibrate { plan: Some(plan), about } => {
-            return run(&socket, printer, &plan, &read_plan(&plan)?, about, Interrupts::of_operator);
+            return run(&socket, printer, &plan, &read_plan(&plan)?, about, WithoutClient::GoesOn);
         }
         Command::Calibrate { plan: None, about } => {
-            return run(
-                &socket,
-                printer,
-                Path::new("calibrate"),
-                calibration::PLAN,
-                about,
-                Interrupts::of_operator,
-            );
+            return run(&socket, printer, Path::new("calibrate"), calibration::PLAN, about, WithoutClient::GoesOn);
         }
         Command::Expose { plan } => return expose::expose(&socket, &plan, printer),
         Command::Viewfinder(arguments) => match change_or_plan(&socket, &arguments)? {
             Wanted::Plan(path, text) => {
-                return run(&socket, printer, &path, &text, arguments.about, Interrupts::of_any_end);
+                return run(&socket, printer, &path, &text, arguments.about, WithoutClient::Ends);
             }
             Wanted::Changed => return changed(printer),
         },
@@ -291,6 +284,15 @@ fn verify(session: &Path, printer: Printer) -> Result<Exit, CommandFailure> {
     Ok(if audit.damage.is_empty() { Exit::Done } else { Exit::Failed })
 }
 
+/// What becomes of a run when its client ends.
+#[derive(PartialEq)]
+enum WithoutClient {
+    /// It is left to the daemon.
+    GoesOn,
+    /// It is cancelled: it is of no use without its client, and would leave the light on.
+    Ends,
+}
+
 /// Runs a plan, given by its path and its text.
 fn run(
     socket: &Path,
@@ -298,10 +300,12 @@ fn run(
     path: &Path,
     text: &str,
     about: RunDescription,
-    interrupts: fn() -> io::Result<Interrupts>,
+    without_client: WithoutClient,
 ) -> Result<Exit, CommandFailure> {
     let RunDescription { detach, operator, sample, note, tags } = about;
-    let params = RunParams { plan: text.to_owned(), operator, sample, note, tags };
+    let attached = !detach && without_client == WithoutClient::Ends;
+    let params = RunParams { plan: text.to_owned(), operator, sample, note, tags, attached };
+    let interrupts = if attached { Interrupts::of_any_end } else { Interrupts::of_operator };
     begin_run(socket, printer, detach, interrupts, |client| {
         client.run(&params).map_err(|error| CommandFailure::of_plan(error, path, text))
     })

@@ -339,7 +339,14 @@ pub(super) fn run_again(dir: &Path) -> Result<RunParams, CommandFailure> {
     let entry = session.state().map_err(ProcessError::from)?.session;
     let path = session.plan_path();
     let plan = fs::read_to_string(&path).map_err(|source| CommandFailure::File { path, source })?;
-    Ok(RunParams { plan, operator: entry.operator, sample: entry.sample, note: entry.note, tags: entry.tags })
+    Ok(RunParams {
+        plan,
+        operator: entry.operator,
+        sample: entry.sample,
+        note: entry.note,
+        tags: entry.tags,
+        attached: false,
+    })
 }
 
 /// What differs between the settings of two sessions, in a sentence each.

@@ -1,6 +1,7 @@
 //! One client: reads its lines, and sends responses and events.
 
 use std::io;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -32,8 +33,10 @@ pub(super) async fn attend(stream: UnixStream, mut seat: Seat, desk: Arc<Desk>, 
     }
     let (reader, writer) = stream.into_split();
     let lines = Lines::new(reader, desk.limits.message_bytes);
-    let mut connection = Connection { lines, writer, desk, seat, role, stop, events: None };
-    match connection.converse().await {
+    let mut connection = Connection { lines, writer, desk, seat, role, stop, events: None, attached: None };
+    let conversed = connection.converse().await;
+    connection.abandon().await;
+    match conversed {
         Ok(()) => tracing::debug!(uid = peer.uid, "a client has gone"),
         // Clients end in this way whenever they exit before they have read everything.
         Err(error) if is_gone(&error) => tracing::debug!(uid = peer.uid, "a client has disconnected"),
@@ -51,6 +54,8 @@ struct Connection {
     role: Role,
     stop: CancellationToken,
     events: Option<broadcast::Receiver<Event>>,
+    /// The session of a run that ends with this connection.
+    attached: Option<PathBuf>,
 }
 
 impl Connection {
@@ -117,6 +122,8 @@ impl Connection {
         if let Some(events) = reply.events {
             self.events = Some(events);
         }
+        // Only one run is in progress at a time, so an earlier one is over.
+        self.attached = reply.attached.or_else(|| self.attached.take());
         Ok(reply.result)
     }
 
@@ -140,6 +147,15 @@ impl Connection {
                 Err(TryRecvError::Lagged(skipped)) => self.notify(Err(RecvError::Lagged(skipped))).await?,
                 Err(TryRecvError::Empty | TryRecvError::Closed) => return Ok(()),
             }
+        }
+    }
+
+    /// Ends the run that is attached to this connection.
+    async fn abandon(&mut self) {
+        let Some(session) = self.attached.take() else { return };
+        let control = self.desk.control.clone();
+        if tokio::task::spawn_blocking(move || control.abandon(&session)).await.is_err() {
+            tracing::error!("a run without its client was not cancelled: see the messages before");
         }
     }
 

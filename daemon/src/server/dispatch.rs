@@ -1,5 +1,7 @@
 //! Maps a method's name and parameters to a call of the daemon.
 
+use std::path::PathBuf;
+
 use raysweep_proto::{
     CheckParams, DesignParams, DoctorParams, Empty, ErrorCode, Event, Method, ResumeParams, Role, RpcError,
     RunParams, Status, UseCalibrationParams, ViewfinderParams, describe, params,
@@ -23,6 +25,14 @@ pub(super) struct CallResult {
     pub result: Value,
     /// For `subscribe`: the events to send from now on.
     pub events: Option<broadcast::Receiver<Event>>,
+    /// The session of a run that ends with the connection.
+    pub attached: Option<PathBuf>,
+}
+
+impl CallResult {
+    fn of(result: impl Serialize) -> Result<Self, RpcError> {
+        Ok(Self { result: value(result)?, events: None, attached: None })
+    }
 }
 
 /// Whether a call may take long, or reads many files.
@@ -44,7 +54,13 @@ pub(super) fn carry_out(
         Method::Check => control.check(&params::<CheckParams>(given)?.plan).and_then(value),
         Method::Design => control.design(&params::<DesignParams>(given)?).and_then(value),
         Method::Doctor => control.doctor(&params::<DoctorParams>(given)?).and_then(value),
-        Method::Run => control.run(params::<RunParams>(given)?).and_then(value),
+        Method::Run => {
+            let params = params::<RunParams>(given)?;
+            let is_attached = params.attached;
+            let started = control.run(params)?;
+            let attached = is_attached.then(|| started.session.clone());
+            return Ok(CallResult { attached, ..CallResult::of(started)? });
+        }
         Method::Resume => control.resume(params::<ResumeParams>(given)?).and_then(value),
         Method::Describe => none(given).and_then(|()| value(describe(env!("CARGO_PKG_VERSION")))),
         Method::Status => {
@@ -65,10 +81,10 @@ pub(super) fn carry_out(
         Method::ArmLight => none(given).and_then(|()| control.arm_light()).and_then(done),
         Method::Subscribe => {
             none(given)?;
-            return Ok(CallResult { result: done(())?, events: Some(control.events()) });
+            return Ok(CallResult { events: Some(control.events()), ..CallResult::of(Empty {})? });
         }
     };
-    Ok(CallResult { result: result?, events: None })
+    Ok(CallResult { result: result?, events: None, attached: None })
 }
 
 /// Reads the parameters of a method that has none.

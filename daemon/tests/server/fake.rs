@@ -24,6 +24,7 @@ pub const KEPT_EVENTS: usize = 16;
 pub struct Fake {
     pub state: Mutex<RunState>,
     pub runs: Mutex<Vec<RunParams>>,
+    pub abandoned: Mutex<Vec<PathBuf>>,
     pub resumed: Mutex<Vec<PathBuf>>,
     /// Held by a test to block a call of `check` with the plan `wait`.
     pub gate: Mutex<()>,
@@ -39,6 +40,7 @@ impl Fake {
         Self {
             state: Mutex::new(RunState::Idle),
             runs: Mutex::default(),
+            abandoned: Mutex::default(),
             resumed: Mutex::default(),
             gate: Mutex::default(),
             checks: AtomicUsize::new(0),
@@ -279,6 +281,10 @@ impl Control for Fake {
             self.finish("cancelled", 38);
         }
         Ok(())
+    }
+
+    fn abandon(&self, session: &Path) {
+        self.abandoned.lock().unwrap().push(session.to_owned());
     }
 
     fn arm_light(&self) -> Result<(), RpcError> {

@@ -155,6 +155,29 @@ fn come_in(daemon: &Daemon) {
 }
 
 #[test]
+fn a_run_that_is_attached_to_its_client_ends_with_it_and_no_other_does() {
+    let daemon = Daemon::with(Limits::default(), Access::new(None));
+    let abandoned = || daemon.fake.abandoned.lock().unwrap().len();
+    for (attached, expected) in [(false, 0), (true, 1)] {
+        let mut other = daemon.client();
+        other.status().unwrap();
+        let mut client = daemon.client();
+        client.run(&RunParams { plan: "fine".into(), attached, ..RunParams::default() }).unwrap();
+        drop(other);
+        // Whoever is served later may still not be: a connection's end is noticed whenever its task gets to run.
+        client.status().unwrap();
+        assert_eq!(abandoned(), 0);
+        drop(client);
+        let since = Instant::now();
+        while abandoned() < expected && since.elapsed() < HANGS {
+            daemon.client().status().unwrap();
+        }
+        assert_eq!(abandoned(), expected);
+    }
+    assert_eq!(*daemon.fake.abandoned.lock().unwrap(), [session()]);
+}
+
+#[test]
 fn one_client_more_than_allowed_is_turned_away() {
     let daemon = Daemon::with(Limits { clients: 2, ..Limits::default() }, Access::new(None));
     let mut first = daemon.client();
