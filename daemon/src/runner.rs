@@ -390,11 +390,7 @@ impl Runner {
             .map_err(|error| no_session(error.to_string()))
     }
 
-    fn resume_session(
-        &self,
-        params: &ResumeParams,
-        orders: &Arc<Orders>,
-    ) -> Result<Begun, RpcError> {
+    fn resume_session(&self, params: &ResumeParams, orders: &Arc<Orders>) -> Result<Begun, RpcError> {
         let session = self.session(&params.session)?;
         let read = |path: PathBuf| {
             let folders = std::slice::from_ref(&self.data);

@@ -106,10 +106,11 @@ fn ended(
     let mut waited_for = Vec::new();
     for event in events {
         match event {
-            Event::Ask { text } => {
+            Event::Ask(question) => {
                 let status = client.status().unwrap();
-                assert_eq!((status.state, status.question.as_ref()), (RunState::Paused, Some(&text)));
-                waited_for.push(text);
+                assert_eq!((status.state, status.question.as_ref()), (RunState::Paused, Some(&question)));
+                assert!(!question.wants_answer, "the run goes on by itself");
+                waited_for.push(question.text);
                 paused(client);
             }
             Event::Finished { state, error, .. } => return Ended { state, error, waited_for },

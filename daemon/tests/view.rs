@@ -360,6 +360,25 @@ fn ten_browsers_cost_a_sweep_and_a_film_no_frame_and_no_bit() {
 }
 
 #[test]
+fn connections_that_ask_nothing_do_not_shut_the_page_out() {
+    let lab = Lab::start();
+    let page = lab.view(None);
+    // More than the process may have files open.
+    let idle: Vec<TcpStream> = (0..1100)
+        .map_while(|nth| {
+            let mut stream = TcpStream::connect(&page.host).ok()?;
+            // Half of them begin with a request.
+            if nth % 2 == 0 {
+                stream.write_all(b"GET / HTTP/1.1\r\nHost: ").ok()?;
+            }
+            Some(stream)
+        })
+        .collect();
+    assert!(idle.len() > 200, "{}", idle.len());
+    assert_eq!(page.get("").0, 200);
+}
+
+#[test]
 fn the_light_of_a_pixel_over_the_delays_is_that_of_the_stack() {
     let lab = Lab::start();
     let session = lab.run(SWEEP);
@@ -387,8 +406,11 @@ fn the_light_of_a_pixel_over_the_delays_is_that_of_the_stack() {
         points += 1;
     }
     assert!(points > 20, "{points}");
-    let (status, ..) = page.get(&format!("session/{name}/delays/5000/7"));
-    assert_eq!(status, 404);
+    for outside in ["delays/5000/7", "pixel/5000/7", "pixel/18446744073709551615/0"] {
+        let (status, _, why) = page.get(&format!("session/{name}/{outside}"));
+        let why = String::from_utf8(why).unwrap();
+        assert!(status == 404 && why.contains("rows and"), "{outside}: {status} {why}");
+    }
 }
 
 /// A run is checked, started, watched, paused, cancelled, resumed, finished; its report is opened; a viewfinder is worked;

@@ -24,13 +24,13 @@ fn run(bench: &Bench, answer: impl Fn(usize, &Bench)) -> (Vec<String>, Ended) {
     let mut asked = Vec::new();
     loop {
         match events.blocking_recv().unwrap() {
-            Event::Ask { text } => {
-                if text.contains("`raysweep continue`") {
+            Event::Ask(question) => {
+                if question.wants_answer {
                     let status = bench.runner.status();
-                    assert_eq!((status.state, status.question.as_ref()), (RunState::Paused, Some(&text)));
+                    assert_eq!((status.state, status.question.as_ref()), (RunState::Paused, Some(&question)));
                     answer(asked.len(), bench);
                 }
-                asked.push(text);
+                asked.push(question.to_string());
             }
             Event::Finished { .. } => {
                 assert_eq!(bench.runner.status().question, None);

@@ -1,6 +1,7 @@
 //! Parameters, results and events. Field names are stable. Times are in seconds, or in microseconds if the
 //! name ends in `_us`.
 
+use std::fmt;
 use std::path::PathBuf;
 
 use raysweep_core::{ClockQuality, Counts, FilmSummary, PointUnderWay, SettingsLatency, VsyncStats};
@@ -190,9 +191,9 @@ pub struct Status {
     pub operators: Option<String>,
     /// What the daemon is doing.
     pub state: RunState,
-    /// What the operator has to do before `continue`, if the run waits for that.
+    /// What the run waits for, if it does.
     #[serde(default)]
-    pub question: Option<String>,
+    pub question: Option<Question>,
     /// The folder of its sessions.
     #[serde(default)]
     pub data: Option<PathBuf>,
@@ -290,6 +291,23 @@ pub struct CheckReport {
     pub response: Option<ResponseCheck>,
     /// Warnings for the operator; none of them prevents the run.
     pub warnings: Vec<String>,
+}
+
+/// What an operator has to do.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub struct Question {
+    /// The task.
+    pub text: String,
+    /// Whether the run waits until `continue` says that it is done; otherwise the run goes on by itself, or is over.
+    pub wants_answer: bool,
+}
+
+/// For people at a terminal.
+impl fmt::Display for Question {
+    fn fmt(&self, to: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let answer = if self.wants_answer { ", then `raysweep continue`" } else { "" };
+        write!(to, "{}{answer}", self.text)
+    }
 }
 
 /// Parameters of `run`.
@@ -413,11 +431,8 @@ pub enum Event {
     Batch(BatchStored),
     /// The viewfinder has a new picture.
     Viewfinder(Box<ViewfinderValues>),
-    /// The run waits for an operator to do this. Obsolete when the run is over.
-    Ask {
-        /// What the operator has to do.
-        text: String,
-    },
+    /// An operator has to do something. Obsolete with the next state of the run.
+    Ask(Question),
     /// A live estimate from the points stored so far is in the live file.
     Live {
         /// Sequence number of its last image in the live file.

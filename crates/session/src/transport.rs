@@ -178,7 +178,8 @@ pub fn read_profiles(dir: &Path, pixels: &[[usize; 2]]) -> Result<Vec<Array1<f32
     let array = zarr::open_array(&DurableStore::new(dir)?, NAME, 3)?;
     let depth = array.shape()[0] as usize;
     let profile = |&[t, s]: &[usize; 2]| {
-        zarr::read_part(&array, [0..depth, t..t + 1, s..s + 1]).map(|part| part.into_flat())
+        zarr::read_part(&array, [0..depth, t..t.saturating_add(1), s..s.saturating_add(1)])
+            .map(|part| part.into_flat())
     };
     pixels.iter().map(profile).collect()
 }
@@ -297,8 +298,10 @@ mod tests {
             for ([t, s], profile) in pixels.into_iter().zip(read_profiles(&in_strips, &pixels).unwrap()) {
                 assert_eq!(profile, volume.slice(s![.., t, s]));
             }
-            let outside = read_profiles(&in_strips, &[[shape.1, 0]]);
-            assert!(matches!(outside, Err(Error::Shape { .. })));
+            for outside in [[shape.1, 0], [usize::MAX, 0], [0, usize::MAX]] {
+                let outside = read_profiles(&in_strips, &[outside]);
+                assert!(matches!(outside, Err(Error::Shape { .. })));
+            }
             fs::remove_dir_all(&in_strips).unwrap();
         }
     }

@@ -123,7 +123,7 @@ pub(super) fn follow(
         match &event {
             // What was typed before the question is no answer to it.
             Event::State { .. } => is_asked = false,
-            Event::Ask { text } if is_attended && text.ends_with("`raysweep continue`") => {
+            Event::Ask(question) if is_attended && question.wants_answer => {
                 enter_pressed();
                 is_asked = true;
                 view.note("or press Enter here when it is done");

@@ -107,7 +107,14 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             return run(&socket, printer, &plan, &read_plan(&plan)?, about, WithoutClient::GoesOn);
         }
         Command::Calibrate { plan: None, about } => {
-            return run(&socket, printer, Path::new("calibrate"), calibration::PLAN, about, WithoutClient::GoesOn);
+            return run(
+                &socket,
+                printer,
+                Path::new("calibrate"),
+                calibration::PLAN,
+                about,
+                WithoutClient::GoesOn,
+            );
         }
         Command::Expose { plan } => return expose::expose(&socket, &plan, printer),
         Command::Viewfinder(arguments) => match change_or_plan(&socket, &arguments)? {

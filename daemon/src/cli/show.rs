@@ -20,7 +20,7 @@ pub(super) fn status(status: &Status) -> String {
         ("daemon", format!("{}, {} rig", status.version, status.rig)),
         ("state", state(status.state).to_owned()),
     ];
-    rows.extend(status.question.iter().map(|question| ("to do", question.clone())));
+    rows.extend(status.question.iter().map(|question| ("to do", question.to_string())));
     if let Some(session) = &status.session {
         rows.push(("session", session.display().to_string()));
     }

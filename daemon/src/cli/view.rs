@@ -83,7 +83,7 @@ impl EventView {
             Event::Vsync(vsync) => self.vsync = Some(*vsync),
             Event::Batch(_) => {}
             Event::Viewfinder(values) => self.viewfinder(values),
-            Event::Ask { text } => self.note(text),
+            Event::Ask(question) => self.note(&question.to_string()),
             Event::Live { points, .. } => self.live = Some(*points),
             Event::Finished {
                 session,

@@ -91,7 +91,7 @@ impl Seat {
             Some(Event::State { state, session }),
             progress.map(Event::Progress),
             viewfinder.map(Event::Viewfinder),
-            question.map(|text| Event::Ask { text }),
+            question.map(Event::Ask),
             vsync.map(Event::Vsync),
         ];
         said.into_iter().flatten().try_for_each(|event| view.show(&event)).map_err(CommandFailure::Output)

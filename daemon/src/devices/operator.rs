@@ -8,7 +8,7 @@ use std::thread::{self, JoinHandle};
 
 use raysweep_core::{DeviceError, DeviceErrorKind, Subject};
 use raysweep_drivers::projector::external::{ShowRequest, WantedPicture};
-use raysweep_proto::Event;
+use raysweep_proto::{Event, Question};
 
 use crate::rig::Stand;
 use crate::run::board::StatusBoard;
@@ -86,8 +86,8 @@ fn ask(text: &str, orders: &Orders, board: &StatusBoard) -> bool {
 
 /// Tells the operator what remains to be done after the run.
 fn tell(question: ShowRequest, board: &StatusBoard) {
-    let text = task(&question.wanted);
-    board.publish(Event::Ask { text: format!("{text}: the run is over and does not wait for it") });
+    let text = format!("{}: the run is over and does not wait for it", task(&question.wanted));
+    board.publish(Event::Ask(Question { text, wants_answer: false }));
     question.refuse("the run is over and did not wait for it");
 }
 
@@ -208,7 +208,7 @@ mod tests {
         assert!(events.try_recv().is_err());
         run.operator.dismiss();
         assert!(projector.blank().is_err());
-        assert!(matches!(events.try_recv(), Ok(Event::Ask { text }) if text.contains("is over")));
+        assert!(matches!(events.try_recv(), Ok(Event::Ask(question)) if question.text.contains("is over")));
         drop(projector);
     }
 }

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use raysweep_core::{ClockQuality, FilmSummary, SettingsLatency};
-use raysweep_proto::{Event, RunState, Status};
+use raysweep_proto::{Event, Question, RunState, Status};
 use tokio::sync::broadcast;
 
 /// Number of events by which a slow subscriber may lag before it misses some.
@@ -87,11 +87,11 @@ impl StatusBoard {
 
     /// Pauses the run for a task of the operator, unless the run is about to end.
     pub fn ask(&self, task: &str) {
-        self.pause_for(format!("{task}, then `raysweep continue`"));
+        self.pause_for(Question { text: task.to_owned(), wants_answer: true });
     }
 
     /// Pauses the run and says what it waits for, unless the run is about to end. Returns whether it is paused.
-    pub fn pause_for(&self, text: String) -> bool {
+    pub fn pause_for(&self, question: Question) -> bool {
         let mut status = self.lock();
         if status.state.may_become(RunState::Paused) {
             status.state = RunState::Paused;
@@ -99,8 +99,8 @@ impl StatusBoard {
             let _ = self.events.send(Event::State { state: RunState::Paused, session });
         }
         if status.state == RunState::Paused {
-            status.question = Some(text.clone());
-            let _ = self.events.send(Event::Ask { text });
+            status.question = Some(question.clone());
+            let _ = self.events.send(Event::Ask(question));
         }
         status.state == RunState::Paused
     }

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use raysweep_proto::RunState;
+use raysweep_proto::{Question, RunState};
 use raysweep_session::Result;
 
 use super::board::StatusBoard;
@@ -40,7 +40,7 @@ pub fn write_patiently<T>(
         if orders.now() == Order::Go || !is_told {
             tracing::warn!(%error, "the run waits for the disk");
             let what = "make room on the disk, or make it writable; the run then goes on by itself";
-            is_told = board.pause_for(format!("{error}: {what}"));
+            is_told = board.pause_for(Question { text: format!("{error}: {what}"), wants_answer: false });
             if !is_told {
                 return written;
             }

@@ -11,7 +11,7 @@ use nix::unistd::Pid;
 use raysweep::live::{EPIPOLAR, FLOODLIT, INDIRECT, LiveFile};
 use raysweep::server::{Access, Limits, Peer};
 use raysweep_core::VsyncStats;
-use raysweep_proto::{Event, RunState};
+use raysweep_proto::{Event, Question, RunState};
 use serde_json::Value;
 
 use crate::fake::{Daemon, session};
@@ -105,7 +105,7 @@ fn every_other_command_prints_for_people_and_for_programs() {
         (vec!["sessions"], "20260101-000000_fake  complete   75/75  fake", "/0/state"),
         (vec!["run", &plan, "--detach"], "/data/20260101-000000_fake", ""),
         (vec!["pause"], "pauses", ""),
-        (vec!["status"], "to do      cover the lens", "/question"),
+        (vec!["status"], "to do      cover the lens", "/question/text"),
         (vec!["continue"], "continues", ""),
         (vec!["cancel"], "kept", ""),
         (vec!["resume", "old", "--detach"], "/data/20260101-000000_fake", ""),
@@ -228,8 +228,11 @@ fn enter_answers_the_question_of_the_run_that_shows_it() {
     let mut keyboard = fs::File::from(terminal.master);
     keyboard.write_all(b"\n").unwrap();
     assert_eq!(run(&daemon, &["pause"]).0, 0);
-    let text = "cover the lens, then `raysweep continue`".to_owned();
-    daemon.fake.publish(Event::Ask { text });
+    // Nothing that goes on by itself is answered.
+    let by_itself = Question { text: "make room on the disk".into(), wants_answer: false };
+    daemon.fake.publish(Event::Ask(by_itself));
+    let question = Question { text: "cover the lens".into(), wants_answer: true };
+    daemon.fake.publish(Event::Ask(question));
     assert!(lines.any(|line| line.unwrap().contains("press Enter")));
     assert_eq!(*daemon.fake.state.lock().unwrap(), RunState::Paused);
     keyboard.write_all(b"\n").unwrap();

@@ -11,8 +11,8 @@ use raysweep_core::{Counts, LossCause, PointUnderWay, VsyncStats};
 use raysweep_proto::{
     BetterPlan, CalibrationInfo, CheckReport, Client, DesignParams, DesignReport, DoctorCheck, DoctorParams,
     DoctorReport, ErrorCode, ErrorRange, Event, ExpectedError, Grade, MirrorStatus, NoiseEstimate,
-    NoiseSource, PlanAdvice, Progress, ResumeParams, RpcError, RunParams, RunState, SessionInfo, Started,
-    Status, ViewfinderParams,
+    NoiseSource, PlanAdvice, Progress, Question, ResumeParams, RpcError, RunParams, RunState, SessionInfo,
+    Started, Status, ViewfinderParams,
 };
 use tokio::runtime::Runtime;
 use tokio::sync::{broadcast, oneshot};
@@ -212,7 +212,8 @@ impl Control for Fake {
             version: "1".into(),
             rig: "plane".into(),
             state,
-            question: (state == RunState::Paused).then(|| "cover the lens".into()),
+            question: (state == RunState::Paused)
+                .then(|| Question { text: "cover the lens".into(), wants_answer: true }),
             data: self.live.parent().map(Path::to_owned),
             session: Some(session()),
             progress: Some(progress()),

@@ -238,7 +238,7 @@ fn judge_sessions(laboratory: &Laboratory) {
                 assert_eq!((state.as_str(), missing), ("complete", 0), "{error:?}, {stored} stored");
                 break;
             }
-            Ok(Event::Ask { .. }) => drop(again.go_on()),
+            Ok(Event::Ask(_)) => drop(again.go_on()),
             Ok(_) | Err(tokio::sync::broadcast::error::RecvError::Lagged(_)) => {}
             Err(error) => panic!("{error}"),
         }

@@ -83,11 +83,13 @@ impl Hub {
         lock(&self.known).live.clone()
     }
 
-    /// Folder of a session that the daemon lists. Nothing else is ever read, whatever a browser asks for.
+    /// Folder of a session that the daemon has listed.
+    pub fn known_session(&self, name: &str) -> Option<PathBuf> {
+        lock(&self.known).sessions.get(name).cloned()
+    }
+
+    /// Folder of a session that the daemon lists now. Nothing else is ever read, whatever a browser asks for.
     pub fn session(&self, name: &str) -> Result<PathBuf, String> {
-        if let Some(folder) = lock(&self.known).sessions.get(name) {
-            return Ok(folder.clone());
-        }
         let listed = Client::connect(&self.socket).and_then(|mut client| client.sessions());
         let listed = listed.map_err(|error| error.to_string())?;
         let named = listed

@@ -8,6 +8,7 @@ mod barred;
 mod guard;
 mod hub;
 mod pictures;
+mod serve;
 mod stored;
 
 use std::fs::File;
@@ -27,7 +28,7 @@ use raysweep_proto::{Client, ClientError, ErrorCode, Method, Role, RpcError, Sta
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 use tokio::net::TcpListener;
-use tokio::sync::Semaphore;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::task::spawn_blocking;
 
 use self::barred::barred;
@@ -75,7 +76,14 @@ const FILES: [(&str, &str, &[u8]); 11] = [
 struct View {
     socket: PathBuf,
     hub: Hub,
-    turns: Semaphore,
+    turns: Arc<Semaphore>,
+}
+
+impl View {
+    /// Waits for a turn to ask the daemon. It lasts as long as what it is given to, even if the browser has gone.
+    async fn turn(&self) -> Option<OwnedSemaphorePermit> {
+        self.turns.clone().acquire_owned().await.ok()
+    }
 }
 
 /// Serves the page on 127.0.0.1 until Ctrl-C; prints its address first. Port 0: any free one.
@@ -89,7 +97,8 @@ pub(super) fn view(socket: &Path, port: u16, printer: Printer) -> Result<Exit, C
         let listener = listener.await.map_err(CommandFailure::View)?;
         let port = listener.local_addr().map_err(CommandFailure::View)?.port();
         let hub = Hub::start(socket).map_err(CommandFailure::View)?;
-        let view = Arc::new(View { socket: socket.to_owned(), hub, turns: Semaphore::new(CALLS_AT_ONCE) });
+        let view =
+            Arc::new(View { socket: socket.to_owned(), hub, turns: Arc::new(Semaphore::new(CALLS_AT_ONCE)) });
         let address = format!("http://127.0.0.1:{port}/{token}/");
         printer
             .print(&json!({ "address": address }), |_| format!("open {address} in a browser; Ctrl-C ends"))?;
@@ -100,9 +109,10 @@ pub(super) fn view(socket: &Path, port: u16, printer: Printer) -> Result<Exit, C
         };
         // Streams of events never end, so connections are not waited for.
         tokio::select! {
-            served = axum::serve(listener, app) => served.map_err(CommandFailure::View),
-            () = ended => Ok(()),
+            () = serve::serve(listener, app) => {}
+            () = ended => {}
         }
+        Ok(())
     });
     // Reads that are still under way are not waited for.
     runtime.shutdown_background();
@@ -174,9 +184,9 @@ async fn call(State(view): State<Arc<View>>, body: Bytes) -> Response {
     let Some(method) = CALLS.into_iter().find(|method| method.name() == call.method) else {
         return refused(StatusCode::FORBIDDEN, &format!("the page may not call `{}`", call.method));
     };
-    let _turn = view.turns.acquire().await;
-    let socket = view.socket.clone();
+    let (turn, socket) = (view.turn().await, view.socket.clone());
     let answer = spawn_blocking(move || {
+        let _turn = turn;
         let result: Value = Client::connect(&socket)?.call(method, &call.params)?;
         let text = match method {
             Method::Check => serde_json::from_value(result.clone()).ok().map(|report| show::check(&report)),
@@ -303,8 +313,12 @@ async fn read_session(
     session: String,
     reading: impl FnOnce(&Path) -> Result<Response, String> + Send + 'static,
 ) -> Response {
+    let listing = match view.hub.known_session(&session) {
+        Some(folder) => Ok(folder),
+        None => Err(view.turn().await),
+    };
     read(move || {
-        let folder = view.hub.session(&session)?;
+        let folder = listing.or_else(|_turn| view.hub.session(&session))?;
         match barred(&folder) {
             Some(why) => Ok(refused(StatusCode::FORBIDDEN, &why)),
             None => reading(&folder),

@@ -70,11 +70,18 @@ pub(super) fn thumbnail(folder: &Path) -> Result<Option<Vec<u8>>, String> {
 /// Light from each relative projector row u to a pixel, with the first u.
 pub(super) fn pixel(folder: &Path, row: usize, column: usize) -> Result<Value, String> {
     let path = Session::open(folder).map_err(told)?.transport_path();
-    let (_, attributes) = transport::describe(&path).map_err(told)?;
+    let ([_, rows, columns], attributes) = transport::describe(&path).map_err(told)?;
+    if row >= rows || column >= columns {
+        return Err(outside(rows, columns));
+    }
     let u_min = attributes.get("u_min").and_then(Value::as_i64);
     let u_min = u_min.ok_or("the transport does not say its u_min; `raysweep process` makes it again")?;
     let profiles = transport::read_profiles(&path, &[[row, column]]).map_err(told)?;
     Ok(json!({ "u_min": u_min, "light": profiles.first().map(|light| light.to_vec()) }))
+}
+
+fn outside(rows: usize, columns: usize) -> String {
+    format!("the image has {rows} rows and {columns} columns, counted from 0")
 }
 
 /// Light of a pixel over the delays of a sweep, from what is stored so far: `{delay_us: [...], exposures: [{exposure_us,
@@ -88,7 +95,7 @@ pub(super) fn delays(folder: &Path, row: usize, column: usize) -> Result<Value, 
     let stack = session.stack().map_err(told)?;
     let shape = stack.shape();
     if row >= shape.rows || column >= shape.columns {
-        return Err(format!("the image has {} rows and {} columns", shape.rows, shape.columns));
+        return Err(outside(shape.rows, shape.columns));
     }
     let counts = |array, point: &PointEntry| {
         let part = stack.read_rows(array, point.index, row..row + 1).map_err(told)?;

@@ -107,11 +107,11 @@ function draw() {
   by("question").hidden = !question;
   document.body.classList.toggle("asks", Boolean(question));
   // The command is for a terminal; here the button does the same.
-  by("question-text").textContent = (question ?? "").replace(", then `raysweep continue`", "");
-  by("answer").disabled = !question;
+  by("question-text").textContent = question?.text ?? "";
+  by("answer").disabled = !question?.wants_answer;
   by("run-name").textContent = session ? nameOf(session) : "No run yet";
   by("pause").disabled = !["armed", "running"].includes(state);
-  by("continue").disabled = state !== "paused" || Boolean(question);
+  by("continue").disabled = state !== "paused" || Boolean(question?.wants_answer);
   by("cancel").disabled = !isUnderWay;
   for (const id of ["start", "check", "find"]) by(id).disabled = isUnderWay || !state;
   // A viewfinder stores nothing.
