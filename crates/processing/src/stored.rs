@@ -1,12 +1,13 @@
 //! A stored session that is being processed, and the results.
 
+use std::io;
 use std::path::{Path, PathBuf};
 
 use raysweep_config::{ConfigError, DotRigFile, Plan, RigFile};
 use raysweep_core::{Size, io_text};
-use raysweep_session::Session;
 use raysweep_session::ledger::State;
 use raysweep_session::stack::Contents;
+use raysweep_session::{Session, input};
 
 use crate::calibration::KeptCalibration;
 use crate::plane::{KnownRig, PlaneTask};
@@ -67,6 +68,19 @@ pub enum ProcessError {
         /// Error of the operating system.
         source: std::io::Error,
     },
+}
+
+impl ProcessError {
+    /// The same error of a session that was processed in a copy: the session itself is what is damaged.
+    #[must_use]
+    pub fn of(self, session: &Path) -> Self {
+        match self {
+            Self::Damaged { damage, is_edited, .. } => {
+                Self::Damaged { dir: session.to_owned(), damage, is_edited }
+            }
+            error => error,
+        }
+    }
 }
 
 /// Most damaged parts that an error names.
@@ -196,8 +210,16 @@ impl Stored<'_> {
     }
 }
 
+/// Longest text file of a session that is read.
+const MOST_TEXT_BYTES: u64 = 1 << 24;
+
 /// Reads a text file of a session.
 pub(crate) fn read(path: &Path) -> Result<String, ProcessError> {
-    std::fs::read_to_string(path)
+    input::open_itself(path, MOST_TEXT_BYTES)
+        .and_then(|file| input::read_open(&file, MOST_TEXT_BYTES))
+        .and_then(|bytes| {
+            String::from_utf8(bytes)
+                .map_err(|_| io::Error::new(io::ErrorKind::InvalidData, "it is not UTF-8 text"))
+        })
         .map_err(|error| ProcessError::Config(format!("cannot read {}: {}", path.display(), io_text(&error))))
 }
