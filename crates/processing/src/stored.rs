@@ -1,13 +1,12 @@
 //! A stored session that is being processed, and the results.
 
-use std::io;
 use std::path::{Path, PathBuf};
 
 use raysweep_config::{ConfigError, DotRigFile, Plan, RigFile};
 use raysweep_core::{Size, io_text};
+use raysweep_session::Session;
 use raysweep_session::ledger::State;
 use raysweep_session::stack::Contents;
-use raysweep_session::{Session, input};
 
 use crate::calibration::KeptCalibration;
 use crate::plane::{KnownRig, PlaneTask};
@@ -205,21 +204,7 @@ impl Stored<'_> {
 
     fn rig<T>(&self, parse: impl FnOnce(&str) -> Result<T, ConfigError>) -> Result<T, ProcessError> {
         let path = self.session.rig_path();
-        let text = read(&path)?;
+        let text = self.session.read_text(&path)?;
         parse(&text).map_err(|error| ProcessError::Config(error.render(&path.display().to_string(), &text)))
     }
-}
-
-/// Longest text file of a session that is read.
-const MOST_TEXT_BYTES: u64 = 1 << 24;
-
-/// Reads a text file of a session.
-pub(crate) fn read(path: &Path) -> Result<String, ProcessError> {
-    input::open_itself(path, MOST_TEXT_BYTES)
-        .and_then(|file| input::read_open(&file, MOST_TEXT_BYTES))
-        .and_then(|bytes| {
-            String::from_utf8(bytes)
-                .map_err(|_| io::Error::new(io::ErrorKind::InvalidData, "it is not UTF-8 text"))
-        })
-        .map_err(|error| ProcessError::Config(format!("cannot read {}: {}", path.display(), io_text(&error))))
 }

@@ -365,7 +365,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("transport.zarr");
         replace_dir(&path, |fresh| write(&fresh.join("old"), b"1")).unwrap();
-        let failed = replace_dir(&path, |fresh| {
+        let failed: Result<()> = replace_dir(&path, |fresh| {
             write(&fresh.join("half"), b"2")?;
             Err(Error::io("write", fresh)(io::Error::other("disk full")))
         });

@@ -184,7 +184,8 @@ impl Session {
     /// As [`Session::open_file`], and [`Error::Codec`] if it is not UTF-8 text.
     pub fn read_text(&self, file: &Path) -> Result<String> {
         let bytes = self.read(file, MOST_TEXT_BYTES)?;
-        String::from_utf8(bytes).map_err(|_| Error::codec("read", file.display())("it is not UTF-8 text"))
+        String::from_utf8(bytes)
+            .map_err(|_not_utf8| Error::codec("read", file.display())("it is not UTF-8 text"))
     }
 
     /// The size of all its files together.

@@ -368,9 +368,9 @@ pub(super) struct PictureOfDifference {
 impl PictureOfDifference {
     fn legend(&self) -> String {
         let Self { file, product, units, white, full_difference } = self;
-        let units = if units.is_empty() { String::new() } else { format!(" {units}") };
+        let units = if units.is_empty() { String::new() } else { format!("\nunit: {units}") };
         format!(
-            "{}\n{product} of A, of B, and B - A, from left to right\nA and B: black is 0, white is {white:.3e}{units} or more\nB - A: black is 0, red is B > A, full at +{full_difference:.3e}{units}, blue is B < A, full at -{full_difference:.3e}{units}",
+            "{}\n{product} of A, of B, and B - A, from left to right\nA and B: black is 0, white is {white:.3e} or more\nB - A: black is 0, red is B > A, full at +{full_difference:.3e}, blue is B < A, full at -{full_difference:.3e}{units}",
             file.display()
         )
     }

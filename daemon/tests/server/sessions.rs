@@ -276,6 +276,12 @@ fn pipes_and_links_in_a_session_are_neither_waited_for_nor_followed() {
         in_place(file, &|path| symlink(&secret, path).unwrap());
         in_place(file, &|path| symlink("/dev/zero", path).unwrap());
     }
+    let pipe = data.path().join("pipe");
+    mkfifo(&pipe, Mode::S_IRWXU).unwrap();
+    for words in [["check", text(&pipe)].as_slice(), &["park", "--state", text(&pipe)]] {
+        let (exit, _, err) = run(words);
+        assert!(exit != 0 && err.contains("not a regular file"), "{words:?}: {err}");
+    }
     // A whole folder, too.
     let products = session.join("products");
     fs::rename(&products, data.path().join("elsewhere")).unwrap();
