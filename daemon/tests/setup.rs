@@ -8,10 +8,13 @@ mod wire_rig;
 use std::fs::{self, File};
 use std::io::{Read, Write};
 use std::os::fd::OwnedFd;
+use std::os::unix::fs::{FileTypeExt, symlink};
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
 use nix::pty::openpty;
+use nix::sys::stat::Mode;
+use nix::unistd::mkfifo;
 use process::{Process, wait_for};
 use raysweep_core::Subject;
 use raysweep_proto::{Client, DoctorReport, Event, Grade, RunParams};
@@ -197,4 +200,37 @@ fn a_person_who_takes_every_default_gets_a_rig_that_can_be_rehearsed() {
     assert!(process.wait().success(), "{said}");
     assert!(said.contains("connected:") && said.contains("next: `raysweep doctor"), "{said}");
     assert!(failures(&examined(folder.path())).is_empty());
+}
+
+#[test]
+fn only_two_regular_files_are_written_both_or_neither() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    fs::write(path("answers.toml"), "camera = 'sim'\nprojector = 'sim'\nvsync = 'sim'\n").unwrap();
+    mkfifo(&path("pipe"), Mode::S_IRWXU).unwrap();
+    symlink("/dev/null", path("link")).unwrap();
+    symlink(".", path("here")).unwrap();
+    let refused = |rig: &str, plan: &str, answers: &str| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_raysweep"));
+        command.args(["setup", "--force", "--answers", answers, "--rig", rig, "--plan", plan]);
+        let output = command.current_dir(folder.path()).stdin(Stdio::null()).output().unwrap();
+        assert!(!output.status.success(), "{rig}, {plan}");
+        String::from_utf8(output.stderr).unwrap()
+    };
+    for other in ["pipe", "link", "here", "/dev/null"] {
+        let said = refused(other, "plan.toml", "answers.toml");
+        assert!(said.contains(&format!("{other} is not a regular file")), "{said}");
+    }
+    assert!(path("link").is_symlink() && fs::symlink_metadata(path("pipe")).unwrap().file_type().is_fifo());
+    for same in ["rig.toml", "./rig.toml", "here/rig.toml"] {
+        let said = refused("rig.toml", same, "answers.toml");
+        assert!(said.contains("--rig and --plan both name rig.toml"), "{said}");
+    }
+    let said = refused("rig.toml", "missing/plan.toml", "answers.toml");
+    assert!(said.contains("missing/plan.toml"), "{said}");
+    assert!(!path("rig.toml").exists(), "one without the other");
+    for endless in ["pipe", "/dev/zero"] {
+        let said = refused("rig.toml", "plan.toml", endless);
+        assert!(said.contains(&format!("cannot read {endless}: it is not a regular file")), "{said}");
+    }
 }

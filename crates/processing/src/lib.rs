@@ -32,8 +32,6 @@ use raysweep_session::ledger::State;
 use raysweep_session::manifest::FileRecord;
 use raysweep_session::{Session, manifest};
 
-use self::stored::read;
-
 pub use export::{ExportFormat, ExportScope, copy_acquired, export, export_as};
 pub use software::SOFTWARE;
 pub use stored::{Asked, ProcessError, Processed, Stored};
@@ -144,7 +142,7 @@ fn keep_damaged(session: &Session, before: Vec<DamagedResult>) -> Result<(), Pro
 /// Processes what is not damaged.
 fn process_sound(session: &Session, state: &State, asked: &Asked) -> Result<Processed, ProcessError> {
     let path = session.plan_path();
-    let plan_text = read(&path)?;
+    let plan_text = session.read_text(&path)?;
     let plan = Plan::parse_stored(&plan_text)
         .map_err(|error| ProcessError::Config(error.render(&path.display().to_string(), &plan_text)))?;
     let stored = Stored { session, state, plan: &plan, plan_text: &plan_text };

@@ -69,6 +69,19 @@ pub enum ProcessError {
     },
 }
 
+impl ProcessError {
+    /// The same error of a session that was processed in a copy: the session itself is what is damaged.
+    #[must_use]
+    pub fn of(self, session: &Path) -> Self {
+        match self {
+            Self::Damaged { damage, is_edited, .. } => {
+                Self::Damaged { dir: session.to_owned(), damage, is_edited }
+            }
+            error => error,
+        }
+    }
+}
+
 /// Most damaged parts that an error names.
 const MOST_NAMED: usize = 10;
 const EDITED: &str =
@@ -191,13 +204,7 @@ impl Stored<'_> {
 
     fn rig<T>(&self, parse: impl FnOnce(&str) -> Result<T, ConfigError>) -> Result<T, ProcessError> {
         let path = self.session.rig_path();
-        let text = read(&path)?;
+        let text = self.session.read_text(&path)?;
         parse(&text).map_err(|error| ProcessError::Config(error.render(&path.display().to_string(), &text)))
     }
-}
-
-/// Reads a text file of a session.
-pub(crate) fn read(path: &Path) -> Result<String, ProcessError> {
-    std::fs::read_to_string(path)
-        .map_err(|error| ProcessError::Config(format!("cannot read {}: {}", path.display(), io_text(&error))))
 }

@@ -46,6 +46,20 @@ pub fn write_with(path: &Path, fill: impl FnOnce(&mut File) -> io::Result<()>) -
     draft.commit()
 }
 
+/// As [`write()`], of several files: none is replaced before the contents of all are on disk.
+///
+/// # Errors
+/// [`Error::Io`]; the files are then unchanged, unless a rename itself failed.
+pub fn write_all(files: &[(&Path, &[u8])]) -> Result<()> {
+    let drafts = files.iter().map(|(path, bytes)| {
+        let mut draft = DraftFile::create(path)?;
+        let written = write_in_pieces(&mut draft.file, bytes).and_then(|()| draft.file.sync_all());
+        written.map_err(draft.failed())?;
+        Ok(draft)
+    });
+    drafts.collect::<Result<Vec<_>>>()?.into_iter().try_for_each(DraftFile::commit)
+}
+
 /// As [`write()`], with the content that another program writes to the path given to `fill`, which returns whether there
 /// is any.
 ///
@@ -98,10 +112,14 @@ pub(crate) fn create_dir_within(path: &Path) -> Result<()> {
 ///
 /// # Errors
 /// The error of `fill`, or [`Error::Io`]; the folder at `path` is then unchanged.
-pub fn replace_dir(path: &Path, fill: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
+pub fn replace_dir<T, E: From<Error>>(
+    path: &Path,
+    fill: impl FnOnce(&Path) -> std::result::Result<T, E>,
+) -> std::result::Result<T, E> {
     let draft = DraftDir::create(path)?;
-    fill(draft.path())?;
-    draft.commit()
+    let filled = fill(draft.path())?;
+    draft.commit()?;
+    Ok(filled)
 }
 
 /// A folder that is written gradually next to the one that it will replace, as in [`replace_dir`]. Removed if
@@ -347,7 +365,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("transport.zarr");
         replace_dir(&path, |fresh| write(&fresh.join("old"), b"1")).unwrap();
-        let failed = replace_dir(&path, |fresh| {
+        let failed: Result<()> = replace_dir(&path, |fresh| {
             write(&fresh.join("half"), b"2")?;
             Err(Error::io("write", fresh)(io::Error::other("disk full")))
         });

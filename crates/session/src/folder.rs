@@ -1,8 +1,9 @@
 //! The folder of a session, and listing the sessions of a data folder.
 
-use std::fs;
+use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
+use std::slice;
 
 use jiff::Timestamp;
 use jiff::tz::TimeZone;
@@ -16,6 +17,8 @@ use crate::products::Products;
 use crate::stack::{Contents, Stack};
 use crate::{Error, Result, durable, input};
 
+/// Longest text of a session that is read at once: the socket takes plans of at most 1 MiB.
+const MOST_TEXT_BYTES: u64 = 1 << 24;
 /// Maximum bytes of a session's name that are used in its folder's name.
 const NAME_MAX_BYTES: usize = 64;
 
@@ -155,6 +158,36 @@ impl Session {
         Ok(Entry::Files { sha256: bound.map(sum).collect::<Result<_>>()? })
     }
 
+    /// Opens one of its files, given by its path in the session or with the session's folder, without following symbolic
+    /// links.
+    ///
+    /// # Errors
+    /// [`Error::Io`] if it is missing, longer than `most_bytes`, no regular file, or elsewhere.
+    pub fn open_file(&self, file: &Path, most_bytes: u64) -> Result<File> {
+        let inner = file.strip_prefix(&self.dir).unwrap_or(file);
+        let opened = input::open_below(slice::from_ref(&self.dir), inner, most_bytes);
+        opened.map_err(Error::io("read", &self.dir.join(inner)))
+    }
+
+    /// Reads one of its files, as [`Session::open_file`] opens it.
+    ///
+    /// # Errors
+    /// As [`Session::open_file`].
+    pub fn read(&self, file: &Path, most_bytes: u64) -> Result<Vec<u8>> {
+        let opened = self.open_file(file, most_bytes)?;
+        input::read_open(&opened, most_bytes).map_err(Error::io("read", file))
+    }
+
+    /// As [`Session::read`], of `plan.toml`, `rig.toml` and other short texts.
+    ///
+    /// # Errors
+    /// As [`Session::open_file`], and [`Error::Codec`] if it is not UTF-8 text.
+    pub fn read_text(&self, file: &Path) -> Result<String> {
+        let bytes = self.read(file, MOST_TEXT_BYTES)?;
+        String::from_utf8(bytes)
+            .map_err(|_not_utf8| Error::codec("read", file.display())("it is not UTF-8 text"))
+    }
+
     /// The size of all its files together.
     ///
     /// # Errors
@@ -186,8 +219,9 @@ impl Session {
     /// # Errors
     /// [`Error::InUse`] during a run, [`Error::Io`] if it is there already or the file system refuses.
     pub fn trash(&self) -> Result<PathBuf> {
-        let dir = fs::canonicalize(&self.dir).map_err(Error::io("find", &self.dir))?;
+        let dir = fs::canonicalize(&self.dir).map_err(moved(&self.dir))?;
         let trash = dir.parent().unwrap_or(&dir).join(TRASH);
+        check_trash(&trash)?;
         self.move_to(&dir, &trash)
     }
 
@@ -196,7 +230,12 @@ impl Session {
     /// # Errors
     /// [`Error::NotASession`] if it is not in such a folder; otherwise as [`Session::trash`].
     pub fn restore(&self) -> Result<PathBuf> {
-        let dir = fs::canonicalize(&self.dir).map_err(Error::io("find", &self.dir))?;
+        if let Some(trash) =
+            self.dir.parent().filter(|parent| parent.file_name().is_some_and(|name| name == TRASH))
+        {
+            check_trash(trash)?;
+        }
+        let dir = fs::canonicalize(&self.dir).map_err(moved(&self.dir))?;
         let trash = dir.parent().filter(|parent| parent.file_name().is_some_and(|name| name == TRASH));
         let Some(data) = trash.and_then(Path::parent) else {
             let why = format!("it is not in a folder {TRASH}, so there is nothing to restore");
@@ -218,13 +257,16 @@ impl Session {
 
     fn move_to(&self, dir: &Path, folder: &Path) -> Result<PathBuf> {
         // No run goes on in a folder that is moved; a damaged ledger is moved too.
-        let _locked = Ledger::open_damaged(&self.ledger_path())?;
+        let _locked = Ledger::open_damaged(&self.ledger_path()).map_err(|error| match error {
+            Error::Io { source, .. } if source.kind() == io::ErrorKind::NotFound => moved(dir)(source),
+            error => error,
+        })?;
         durable::create_dir_all(folder)?;
         let target = folder.join(dir.file_name().unwrap_or_default());
         if target.exists() {
             return Err(Error::io("replace", &target)(io::ErrorKind::AlreadyExists.into()));
         }
-        fs::rename(dir, &target).map_err(Error::io("move", dir))?;
+        fs::rename(dir, &target).map_err(moved(dir))?;
         Ok(target)
     }
 
@@ -331,6 +373,28 @@ impl Session {
     /// `manifest.json`, see [`crate::manifest`].
     pub fn manifest_path(&self) -> PathBuf {
         self.dir.join("manifest.json")
+    }
+}
+
+/// For `map_err`: a session that is missing where it has just been seen was moved by another process.
+fn moved(dir: &Path) -> impl FnOnce(io::Error) -> Error {
+    move |error| match error.kind() {
+        io::ErrorKind::NotFound => {
+            let why = "it is not there any more; another process has already moved or deleted it";
+            Error::io("move", dir)(io::Error::new(io::ErrorKind::NotFound, why))
+        }
+        _ => Error::io("move", dir)(error),
+    }
+}
+
+/// Refuses a trash that leads elsewhere: what is moved there would leave the data folder.
+fn check_trash(trash: &Path) -> Result<()> {
+    match fs::symlink_metadata(trash) {
+        Ok(found) if !found.is_dir() => {
+            let why = "it is not a folder itself, and what is moved through it would leave the data folder: put a folder in its place";
+            Err(Error::io("use the trash", trash)(io::Error::new(io::ErrorKind::NotADirectory, why)))
+        }
+        _ => Ok(()),
     }
 }
 
@@ -457,6 +521,21 @@ mod tests {
             shape: StackShape { contents: Contents::Sweep { points: 4, exposures: 2 }, rows: 3, columns: 5 },
             first_row: 0,
         }
+    }
+
+    #[test]
+    fn who_moves_a_session_second_is_told_that_it_was_moved() {
+        let data = tempfile::tempdir().unwrap();
+        let (first, ledger) = Session::create(data.path(), session("s"), "plan", "rig").unwrap();
+        drop(ledger);
+        let second = Session::open(first.dir()).unwrap();
+        let trashed = Session::open(&first.trash().unwrap()).unwrap();
+        let said = second.trash().unwrap_err().to_string();
+        assert!(said.contains("already moved or deleted it"), "{said}");
+        let again = Session::open(trashed.dir()).unwrap();
+        trashed.restore().unwrap();
+        let said = again.restore().unwrap_err().to_string();
+        assert!(said.contains("already moved or deleted it"), "{said}");
     }
 
     #[test]

@@ -22,6 +22,21 @@ pub fn open(path: &Path, most_bytes: u64) -> io::Result<File> {
     regular(OpenOptions::new().read(true).custom_flags(OFlag::O_NONBLOCK.bits()).open(path)?, most_bytes)
 }
 
+/// As [`open`], but the file itself, not what a symbolic link in its place leads to.
+///
+/// # Errors
+/// As [`open`], and `InvalidInput` for a symbolic link.
+pub fn open_itself(path: &Path, most_bytes: u64) -> io::Result<File> {
+    let flags = OFlag::O_NONBLOCK | OFlag::O_NOFOLLOW;
+    match OpenOptions::new().read(true).custom_flags(flags.bits()).open(path) {
+        Err(error) if error.raw_os_error() == Some(Errno::ELOOP as i32) => Err(io::Error::new(
+            ErrorKind::InvalidInput,
+            "it is a symbolic link, and a session contains none: put the file itself in its place",
+        )),
+        opened => regular(opened?, most_bytes),
+    }
+}
+
 /// Reads a regular file of at most `most_bytes`, even if it grows meanwhile.
 ///
 /// # Errors

@@ -7,8 +7,7 @@
 //! | plan, rig, calibration and other inputs | the ledger's `files`; in sessions of format 1, the manifest |
 //! | results, and the ledger as it was when they were made | the manifest, which has a checksum of its own |
 
-use std::fs::File;
-use std::io::Read;
+use std::io::{ErrorKind, Read};
 use std::path::Path;
 
 use rayon::prelude::*;
@@ -19,7 +18,7 @@ use crate::folder::Session;
 use crate::ledger::{LedgerText, PointEntry, State};
 use crate::manifest::{self, FileRecord, Manifest};
 use crate::stack::{ArrayName, crc32};
-use crate::{Result, film};
+use crate::{Error, Result, film, input};
 
 /// The result of checking all checksums of a session.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
@@ -93,18 +92,18 @@ impl Audit {
             let why = match found.get(file) {
                 // Lines are appended after the manifest was written, and those with damage have been named.
                 Some(path) if file == LEDGER => {
-                    (lines_are_sound && !begins_with(path, record)?).then_some(SHORTENED)
+                    (lines_are_sound && !begins_with(path, record)?).then(|| SHORTENED.into())
                 }
                 _ if state.files().contains_key(file) || is_data(file) => None,
-                Some(path) => (FileRecord::read(path)? != *record).then_some(NOT_OF_MANIFEST),
-                None => Some(MISSING),
+                Some(path) => why_unlike(path, &record.sha256, NOT_OF_MANIFEST)?,
+                None => Some(MISSING.into()),
             };
             let file = file.clone();
             let part = match is_result(&file, &state.session.kind) {
                 true => DamagedPart::Result { file },
                 false => DamagedPart::Input { file },
             };
-            Ok(why.map(|why| Damage { part, why: why.into() }))
+            Ok(why.map(|why| Damage { part, why }))
         };
         let compared: Vec<Option<Damage>> = recorded.par_iter().map(compare).collect::<Result<_>>()?;
         self.damage.extend(compared.into_iter().flatten());
@@ -138,7 +137,7 @@ fn is_result(file: &str, kind: &str) -> bool {
 fn begins_with(path: &Path, record: &FileRecord) -> Result<bool> {
     let read = |path: &Path| {
         let mut begin = Vec::new();
-        File::open(path)?.take(record.bytes).read_to_end(&mut begin).map(|_| begin)
+        input::open_itself(path, u64::MAX)?.take(record.bytes).read_to_end(&mut begin).map(|_| begin)
     };
     let begin = read(path).map_err(crate::Error::io("read", path))?;
     Ok(FileRecord::of(&begin) == *record)
@@ -151,15 +150,56 @@ fn begins_with(path: &Path, record: &FileRecord) -> Result<bool> {
 pub fn changed_inputs(session: &Session, state: &State) -> Result<Vec<Damage>> {
     let mut changed = Vec::new();
     for (file, sha256) in state.files() {
-        let path = session.dir().join(file);
-        let why = match path.exists() {
-            true => (FileRecord::read(&path)?.sha256 != *sha256).then_some(NOT_OF_LEDGER),
-            false => Some(MISSING),
-        };
+        let why = why_unlike(&session.dir().join(file), sha256, NOT_OF_LEDGER)?;
         let part = DamagedPart::Input { file: file.clone() };
-        changed.extend(why.map(|why| Damage { part, why: why.into() }));
+        changed.extend(why.map(|why| Damage { part, why }));
     }
     Ok(changed)
+}
+
+/// Which of these files, given by their paths in the session, are not as the ledger or the manifest has them. Files that
+/// neither names are left out: a session that is not complete has no manifest.
+///
+/// # Errors
+/// [`crate::Error::Io`] if a file cannot be read.
+pub fn damaged_files(session: &Session, state: &State, files: &[String]) -> Result<Vec<Damage>> {
+    let mut damage = Vec::new();
+    let recorded = match manifest::read(session) {
+        Ok(Manifest { files, .. }) => files,
+        Err(Error::Io { source, .. }) if source.kind() == ErrorKind::NotFound => Default::default(),
+        Err(error) => {
+            damage.push(Damage { part: DamagedPart::Manifest, why: error.to_string() });
+            Default::default()
+        }
+    };
+    for file in files {
+        let path = session.dir().join(file);
+        let why = match (state.files().get(file), recorded.get(file)) {
+            (Some(sha256), _) => why_unlike(&path, sha256, NOT_OF_LEDGER)?,
+            (None, Some(record)) => why_unlike(&path, &record.sha256, NOT_OF_MANIFEST)?,
+            (None, None) => None,
+        };
+        let file = file.clone();
+        let part = match is_result(&file, &state.session.kind) {
+            true => DamagedPart::Result { file },
+            false => DamagedPart::Input { file },
+        };
+        damage.extend(why.map(|why| Damage { part, why }));
+    }
+    Ok(damage)
+}
+
+/// Why a file is not the one that has this SHA-256, if it is another, is missing, or is no file at all.
+fn why_unlike(path: &Path, sha256: &str, unlike: &str) -> Result<Option<String>> {
+    match FileRecord::read(path) {
+        Ok(found) => Ok((found.sha256 != *sha256).then(|| unlike.into())),
+        Err(Error::Io { source, .. }) if source.kind() == ErrorKind::NotFound => Ok(Some(MISSING.into())),
+        // A symbolic link, a pipe, a device.
+        Err(Error::Io { source, .. }) if source.kind() == ErrorKind::InvalidInput => {
+            Ok(Some(source.to_string()))
+        }
+        Err(error) => Err(error),
+    }
 }
 
 /// The stored data that are damaged: they cannot be read, or have another checksum than their line of the ledger.

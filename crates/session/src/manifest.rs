@@ -1,7 +1,7 @@
 //! `manifest.json`: the software that made the session, and the checksum of each file.
 
 use std::collections::BTreeMap;
-use std::fs::{self, File};
+use std::fs;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -13,7 +13,7 @@ use sha2::{Digest, Sha256};
 
 use crate::folder::Session;
 use crate::ledger::{FORMAT, State};
-use crate::{Error, Result, durable};
+use crate::{Error, Result, durable, input};
 
 /// The content of `manifest.json`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -110,6 +110,8 @@ pub fn keep_records(session: &Session, damaged: &BTreeMap<String, FileRecord>) -
     store(session, &manifest)
 }
 
+/// Longest manifest that is read: an estimate of twice that of the longest run.
+const MOST_BYTES: u64 = 256 << 20;
 /// Between the manifest and its checksum, its last key.
 const KEY: &str = ",\n  \"sha256\": \"";
 /// After the checksum.
@@ -139,7 +141,7 @@ fn is_sound(text: &[u8], format: u32) -> bool {
 /// [`Error::Io`] if it is missing, [`Error::Codec`] if it is damaged, [`Error::NewerFormat`].
 pub fn read(session: &Session) -> Result<Manifest> {
     let path = session.manifest_path();
-    let text = fs::read(&path).map_err(Error::io("read", &path))?;
+    let text = session.read(&path, MOST_BYTES)?;
     let manifest: Manifest = serde_json::from_slice(&text).map_err(Error::codec("read", path.display()))?;
     if manifest.format > FORMAT {
         return Err(Error::NewerFormat { path, found: manifest.format, known: FORMAT });
@@ -200,12 +202,12 @@ fn list_files(dir: &Path, prefix: &str, files: &mut Vec<(String, PathBuf)>) -> R
 }
 
 impl FileRecord {
-    /// Of a file.
+    /// Of a file of a session.
     ///
     /// # Errors
-    /// [`Error::Io`] if it cannot be read.
+    /// [`Error::Io`] if it cannot be read, or is a symbolic link or no regular file.
     pub fn read(path: &Path) -> Result<Self> {
-        let mut file = File::open(path).map_err(Error::io("read", path))?;
+        let mut file = input::open_itself(path, u64::MAX).map_err(Error::io("read", path))?;
         let mut digest = Sha256::new();
         let mut bytes = 0;
         let mut buffer = vec![0; 1 << 16];

@@ -8,6 +8,7 @@
 //!
 //! Values are linear. Every file is written durably, and the same input gives the same bytes.
 
+use std::fs::File;
 use std::io::{self, BufWriter};
 use std::path::{Path, PathBuf};
 
@@ -17,7 +18,7 @@ use serde_json::{Map, Value};
 
 pub use self::video::{VideoWriter, video_tone_map};
 pub use self::volume::VolumeWriter;
-use crate::{Error, Result, durable, exr_file};
+use crate::{Error, Result, durable, exr_file, input};
 
 mod video;
 mod volume;
@@ -192,7 +193,7 @@ impl Products {
     /// [`Error::Io`] if it is missing, [`Error::Codec`] if it is damaged.
     pub fn read_image(&self, name: &str) -> Result<Array2<f32>> {
         let path = self.path(name, "npy")?;
-        let bytes = std::fs::read(&path).map_err(Error::io("read", &path))?;
+        let bytes = input::read_open(&self.open(&path)?, u64::MAX).map_err(Error::io("read", &path))?;
         ndarray_npy::ReadNpyExt::read_npy(bytes.as_slice()).map_err(Error::codec("read", path.display()))
     }
 
@@ -203,7 +204,7 @@ impl Products {
     pub fn read_array(&self, name: &str) -> Result<ArrayD<f32>> {
         let path = self.path(name, "npy")?;
         let failed = || Error::io("read", &path);
-        let mut file = std::fs::File::open(&path).map_err(failed())?;
+        let mut file = self.open(&path)?;
         let length = usize::try_from(file.metadata().map_err(failed())?.len()).unwrap_or(usize::MAX);
         // Aligned for the view, which compares the header with the length before anything is allocated for it.
         let mut aligned = vec![0_f32; length.div_ceil(size_of::<f32>())];
@@ -211,6 +212,34 @@ impl Products {
         io::Read::read_exact(&mut file, bytes).map_err(failed())?;
         let view = ArrayViewD::<f32>::view_npy(bytes).map_err(Error::codec("read", path.display()))?;
         Ok(view.to_owned())
+    }
+
+    /// The files of all products, by path; those of a video are in a folder of their own. Symbolic links are left out.
+    pub fn files(&self) -> Vec<PathBuf> {
+        fn below(dir: &Path, files: &mut Vec<PathBuf>) {
+            for entry in std::fs::read_dir(dir).into_iter().flatten().flatten() {
+                match entry.file_type() {
+                    Ok(kind) if kind.is_dir() => below(&entry.path(), files),
+                    Ok(kind) if kind.is_file() => files.push(entry.path()),
+                    _ => {}
+                }
+            }
+        }
+        let mut files = Vec::new();
+        if std::fs::symlink_metadata(&self.dir).is_ok_and(|dir| dir.is_dir()) {
+            below(&self.dir, &mut files);
+        }
+        files.sort();
+        files
+    }
+
+    /// Opens a file of the folder; neither the folder nor the file may be a symbolic link.
+    fn open(&self, path: &Path) -> Result<File> {
+        if std::fs::symlink_metadata(&self.dir).is_ok_and(|dir| dir.is_symlink()) {
+            let why = "it is a symbolic link, and a session contains none";
+            return Err(Error::io("open folder", &self.dir)(io::Error::other(why)));
+        }
+        input::open_itself(path, u64::MAX).map_err(Error::io("read", path))
     }
 
     /// Writes a product's mask; returns it as a channel.

@@ -39,6 +39,11 @@ pub(crate) struct DurableStore {
 
 impl DurableStore {
     pub(crate) fn new(root: &Path) -> Result<Arc<DurableStore>> {
+        if std::fs::symlink_metadata(root).is_ok_and(|found| found.is_symlink()) {
+            let why =
+                "it is a symbolic link, and a session contains none: put the folder itself in its place";
+            return Err(Error::io("open", root)(io::Error::other(why)));
+        }
         let files = FilesystemStore::new(root).map_err(Error::zarr("open", root))?;
         Ok(Arc::new(DurableStore { root: root.to_owned(), files, draft: false }))
     }
@@ -61,7 +66,11 @@ impl ReadableStorageTraits for DurableStore {
         key: &StoreKey,
         byte_ranges: ByteRangeIterator<'a>,
     ) -> std::result::Result<MaybeBytesIterator<'a>, StorageError> {
-        self.files.get_partial_many(key, byte_ranges)
+        // A pipe would block, a link lead out of the session. What is missing, the store says.
+        match std::fs::symlink_metadata(self.files.key_to_fspath(key)) {
+            Ok(found) if !found.is_file() => Err(StorageError::Other(format!("{key} is not a regular file"))),
+            _ => self.files.get_partial_many(key, byte_ranges),
+        }
     }
 
     fn size_key(&self, key: &StoreKey) -> std::result::Result<Option<u64>, StorageError> {

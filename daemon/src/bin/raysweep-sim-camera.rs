@@ -22,11 +22,13 @@ fn main() -> ExitCode {
 }
 
 fn run(arguments: &SimCameraArguments) -> Result<(), Box<dyn std::error::Error>> {
+    let faults = table::<Faults>("fault", &arguments.faults)?;
+    faults.check().map_err(|error| format!("--fault: {error}"))?;
     let setup = GigeSetup {
         address: arguments.address,
         serial: arguments.serial.clone(),
         clock: table::<CameraClock>("clock", &arguments.clock)?,
-        faults: table::<Faults>("fault", &arguments.faults)?,
+        faults,
         zipped: arguments.zipped,
     };
     if let Some((width, height)) = arguments.test_pictures {

@@ -50,6 +50,7 @@ mod with_aravis {
     };
     use serde_json::json;
 
+    use super::super::plan_file::read_small;
     use super::{CameraCommand, CommandFailure, Exit, Printer};
 
     /// Lists the cameras that respond.
@@ -72,8 +73,7 @@ mod with_aravis {
                 Ok(Exit::Done)
             }
             CameraCommand::Load { file, camera } => {
-                let text = fs::read_to_string(&file)
-                    .map_err(|source| CommandFailure::File { path: file.clone(), source })?;
+                let text = read_small(&file)?;
                 let camera = the_camera(camera)?;
                 let (taken, refused) = load_features(&camera, &text)?;
                 let value = json!({ "camera": camera, "taken": taken, "refused": refused });

@@ -12,6 +12,7 @@ use raysweep_proto::{ClientError, ErrorCode, RpcError};
 use serde_json::{Value, json};
 
 use super::exit::Exit;
+use super::printer::{is_unprintable, printable};
 use crate::journal;
 use crate::live::LiveError;
 use crate::rig::RigError;
@@ -103,7 +104,7 @@ impl CommandFailure {
                     Some(LabeledSpan::new_with_span(Some(label), start..end.clamp(start, text.len())))
                 });
                 let (labels, help) = (labels.collect(), data.and_then(|data| data.help));
-                let plan = NamedSource::new(path.display().to_string(), text.to_owned());
+                let plan = NamedSource::new(printable(&path.display().to_string()), shown(text));
                 Self::Plan(Box::new(PlanProblem { error, plan, labels, help }))
             }
             error => error.into(),
@@ -122,7 +123,10 @@ impl CommandFailure {
                 let _ = writeln!(io::stdout(), "{}", json!({ "error": failure.for_programs() }));
             }
             Self::Plan(problem) => eprintln!("{:?}", miette::Report::new(*problem)),
-            failure => eprintln!("{}raysweep: {failure}", journal::error_prefix()),
+            failure => {
+                let text = failure.to_string();
+                eprintln!("{}raysweep: {}", journal::error_prefix(), printable(&text));
+            }
         }
         exit
     }
@@ -174,6 +178,13 @@ impl CommandFailure {
             | Self::Output(_) => Exit::Failed,
         }
     }
+}
+
+/// A plan's text as it may be shown, with every character at its place: labels count bytes.
+fn shown(plan: &str) -> String {
+    let shown =
+        |letter: char| if is_unprintable(letter) { "?".repeat(letter.len_utf8()) } else { letter.into() };
+    plan.chars().map(shown).collect()
 }
 
 #[cfg(test)]

@@ -42,8 +42,8 @@ use self::exit::Exit;
 use self::failure::CommandFailure;
 use self::follow::{Interrupts, OnInterrupt, follow};
 use self::plan_file::read_plan;
-use self::printer::Printer;
-use self::sessions::{Compared, SessionView};
+use self::printer::{Printer, printable};
+use self::sessions::{Compared, SessionView, write_picture_of_difference};
 use self::setup::{SetupFiles, setup};
 use self::view::EventView;
 use self::viewfinder::{Wanted, change_or_plan, changed};
@@ -184,23 +184,27 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
         Command::Sessions(filter) => {
             let mut listed = connect()?.sessions()?;
             listed.retain(|session| filter.keeps(session));
-            printer.print(&listed, |sessions| show::sessions(sessions))?;
+            let fitting = listed.len();
+            listed.retain(|session| filter.shows(session));
+            printer.print(&listed, |sessions| show::sessions(sessions, fitting - sessions.len()))?;
         }
         Command::Show { session, thumbnails } => {
             let session = folder_of(session, &socket);
             let mut view = SessionView::read(&session)?;
             if let Some(folder) = thumbnails {
+                let session = Session::open(&session).map_err(ProcessError::from)?;
                 view.thumbnails = thumbnails::write(&session, &folder)?;
+                view.check_products(&session, &thumbnails::pictures(&session))?;
             }
             printer.print(&view, SessionView::text)?;
         }
         Command::Diff { a, b, picture, product } => {
             let (a, b) = (folder_of(a, &socket), folder_of(b, &socket));
-            if let Some(path) = picture {
-                let png = sessions::picture_of_difference([&a, &b], &product)?;
-                fs::write(&path, png).map_err(|source| CommandFailure::Write { path, source })?;
+            let mut compared = Compared::read([&a, &b])?;
+            if let Some(file) = picture {
+                compared.picture = Some(write_picture_of_difference([&a, &b], &product, file)?);
             }
-            printer.print(&Compared::read([&a, &b])?, Compared::text)?;
+            printer.print(&compared, Compared::text)?;
         }
         Command::Rerun { session, detach } => {
             return rerun(&socket, printer, &folder_of(session, &socket), detach);
@@ -240,15 +244,17 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             if let Some(to) = &to {
                 copy_acquired(&session, to)?;
             }
+            let given = session.clone();
             let session = to.clone().unwrap_or(session);
             let memory_limit_bytes = memory.map(|size| size.as_u64());
             let asked = Asked { products, only, memory_limit_bytes, accept_damage, accept_edits };
-            let made = process_asked(&session, &asked).inspect_err(|_| {
-                // It was made for this, and the next try may want its name.
-                if let Some(made) = &to {
-                    let _ = fs::remove_dir_all(made);
-                }
-            })?;
+            let made =
+                process_asked(&session, &asked).map_err(|error| error.of(&given)).inspect_err(|_| {
+                    // It was made for this, and the next try may want its name.
+                    if let Some(made) = &to {
+                        let _ = fs::remove_dir_all(made);
+                    }
+                })?;
             let value = json!({
                 "report": made.report, "stored": made.stored, "points": made.points, "problems": made.problems,
             });
@@ -270,12 +276,23 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             let session = folder_of(session, &socket);
             let to = to.unwrap_or_else(|| export_path(&session, format));
             let scope = if stack { ExportScope::ResultsAndArrays } else { ExportScope::Results };
+            let state =
+                Session::open(&session).and_then(|session| session.state()).map_err(ProcessError::from)?;
+            let (stored, points) = (state.stored_points(), state.session.shape.points());
             let files = match format {
                 Some(format) => export_as(&session, &to, accept_damage, scope, format)?,
                 None => export(&session, &to, accept_damage, scope)?,
             };
-            let value = json!({ "folder": to, "files": files });
-            printer.print(&value, |_| format!("{files} files copied to {}", to.display()))?;
+            let value = json!({ "folder": to, "files": files, "is_over": state.end.is_some(), "stored": stored, "points": points });
+            printer.print(&value, |_| {
+                let copied = format!("{files} files copied to {}", to.display());
+                match state.end {
+                    Some(_) => copied,
+                    None => format!(
+                        "{copied}\nthe session's run has not ended: it is still being acquired, or was cut off; {stored} of {points} points were stored"
+                    ),
+                }
+            })?;
         }
     }
     Ok(Exit::Done)
@@ -331,7 +348,7 @@ fn rerun(socket: &Path, printer: Printer, session: &Path, detach: bool) -> Resul
             // The run goes on all the same.
             Err(failure) => format!("what has changed since is not known: {failure}"),
         };
-        eprintln!("{said}");
+        eprintln!("{}", printable(&said));
         Ok(started)
     })
 }

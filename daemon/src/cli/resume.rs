@@ -1,6 +1,5 @@
 //! The session that `resume --auto` resumes.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use raysweep_config::AnyRigFile;
@@ -8,6 +7,7 @@ use raysweep_proto::SessionInfo;
 use raysweep_session::Session;
 
 use super::CommandFailure;
+use super::plan_file::read_small;
 
 /// A run that ends the daemon again and again would otherwise be resumed, with its light, for ever.
 const MOST_BARREN_RESUMES: u32 = 3;
@@ -24,10 +24,7 @@ pub(super) fn cut_off(sessions: &[SessionInfo]) -> Result<Result<PathBuf, String
     if newest.state != "unfinished" {
         return Ok(Err(format!("nothing to resume: the newest session, {shown}, is {}", newest.state)));
     }
-    let read = |file| {
-        let path = newest.session.join(file);
-        fs::read_to_string(&path).map_err(|source| CommandFailure::File { path, source })
-    };
+    let read = |file| read_small(&newest.session.join(file));
     // Calibrations and darks ask an operator to put something before the camera; a film's scene has moved on.
     let plan = toml::from_str::<toml::Table>(&read("plan.toml")?).unwrap_or_default();
     if plan.get("kind").and_then(toml::Value::as_str) != Some("sweep") {
@@ -59,6 +56,8 @@ fn name(session: &Path) -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use raysweep_session::ledger::{Entry, FORMAT, SessionEntry};
     use raysweep_session::stack::{Contents, StackShape};
 

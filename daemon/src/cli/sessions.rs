@@ -1,26 +1,31 @@
 //! Finding, reading and keeping sessions: `sessions`, `show`, `diff`, `rerun`, `note`, `trash` and `restore`.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use jiff::Timestamp;
 use jiff::civil::Date;
 use jiff::tz::TimeZone;
-use ndarray::{Array2, Axis, concatenate};
+use ndarray::{Array2, Axis, concatenate, stack};
 use raysweep_core::Counts;
 use raysweep_processing::ProcessError;
 use raysweep_processing::calibration::CalibrationHeader;
 use raysweep_proto::{RunParams, SessionInfo};
-use raysweep_session::Session;
-use raysweep_session::ledger::{EndState, Remark};
+use raysweep_session::integrity::damaged_files;
+use raysweep_session::ledger::{EndState, Remark, State};
 use raysweep_session::report::{Picture, ToneMap};
+use raysweep_session::{Session, durable};
 use serde::Serialize;
 use serde_json::Value;
 
 use super::failure::CommandFailure;
 use super::show::{block, duration};
+use super::thumbnails;
 
+/// Files of a session whose content `show` tells: those of them that are short, so that their checksums cost nothing.
+const READ: [&str; 4] = ["plan.toml", "rig.toml", "calibration.toml", "products/transport.json"];
+/// Longest metadata of the transport.
+const MOST_FINDINGS_BYTES: u64 = 1 << 24;
 /// Columns between the images of a picture.
 const GAP_PX: usize = 4;
 /// Percentile of the pixels that maps to white in a picture.
@@ -50,9 +55,22 @@ pub(super) struct SessionFilter {
     /// Only those in this state
     #[arg(long, value_name = "STATE", value_parser = ["complete", "cancelled", "faulted", "unfinished", "unreadable"])]
     state: Option<String>,
+    /// Only those of this kind; without it, all but viewfinders, which hold no images
+    #[arg(long, value_name = "KIND", value_parser = KINDS)]
+    kind: Option<String>,
 }
 
+/// The kinds of plans.
+const KINDS: [&str; 8] =
+    ["sweep", "film", "batches", "response", "darks", "patterns", "calibration", VIEWFINDER];
+const VIEWFINDER: &str = "viewfinder";
+
 impl SessionFilter {
+    /// Whether a session that fits is shown: viewfinders are only if they are asked for.
+    pub fn shows(&self, info: &SessionInfo) -> bool {
+        self.kind.is_some() || info.kind != VIEWFINDER
+    }
+
     /// Whether a session is to be listed.
     pub fn keeps(&self, info: &SessionInfo) -> bool {
         let contains = |wanted: &Option<String>, found: Option<&str>| {
@@ -70,6 +88,7 @@ impl SessionFilter {
             && self.since.is_none_or(|since| created().is_some_and(|created| created >= since))
             && self.until.is_none_or(|until| created().is_some_and(|created| created <= until))
             && self.state.as_ref().is_none_or(|state| *state == info.state)
+            && self.kind.as_ref().is_none_or(|kind| *kind == info.kind)
     }
 }
 
@@ -91,6 +110,8 @@ pub(super) struct SessionView {
     points: usize,
     counts: Counts,
     light_s: Option<f64>,
+    /// What of the files that this was read from is damaged.
+    damage: Vec<String>,
     /// `plan.toml`, by key.
     settings: BTreeMap<String, String>,
     /// When the calibration was measured that it uses.
@@ -112,7 +133,7 @@ impl SessionView {
         let session = Session::open(dir).map_err(ProcessError::from)?;
         let state = session.state().map_err(ProcessError::from)?;
         let (stored, points) = (state.stored_points(), state.session.shape.points());
-        let in_products = files_below(&session.products_path());
+        let in_products = session.products().files();
         let with_ending = |ending: &str| -> Vec<PathBuf> {
             in_products
                 .iter()
@@ -121,6 +142,7 @@ impl SessionView {
                 .collect()
         };
         let report = session.report_path();
+        let damage = damaged(&session, &state, &READ.map(String::from))?;
         let (entry, remarks, end) = (state.session.clone(), state.remarks.clone(), state.end.clone());
         Ok(Self {
             session: dir.to_owned(),
@@ -138,7 +160,8 @@ impl SessionView {
             points,
             counts: state.counts,
             light_s: end.and_then(|end| end.light_s),
-            settings: flat(&session.plan_path())?,
+            settings: flat(&session, "plan.toml")?,
+            damage,
             calibration: calibration_of(dir),
             findings: findings_of(&session),
             remarks,
@@ -148,6 +171,14 @@ impl SessionView {
             pictures: with_ending("png").into_iter().filter(|path| path.ends_with("0000.png")).collect(),
             thumbnails: Vec::new(),
         })
+    }
+
+    /// Also says which of these products are damaged: those that are shown.
+    pub fn check_products(&mut self, session: &Session, names: &[String]) -> Result<(), CommandFailure> {
+        let state = session.state().map_err(ProcessError::from)?;
+        let files: Vec<String> = names.iter().map(|name| format!("products/{name}.npy")).collect();
+        self.damage.extend(damaged(session, &state, &files)?);
+        Ok(())
     }
 
     /// One screen.
@@ -165,6 +196,7 @@ impl SessionView {
         }
         rows.push(("state", format!("{}: {} of {} points stored", self.state, self.stored, self.points)));
         rows.extend(self.error.iter().map(|error| ("error", error.clone())));
+        rows.extend(self.damage.iter().map(|damage| ("DAMAGED", damage.clone())));
         let Counts { expected, averaged, .. } = self.counts;
         rows.push(("frames", format!("{averaged} used of {expected}, {}", self.counts.losses())));
         rows.extend(self.light_s.map(|light_s| ("light", duration(light_s))));
@@ -204,6 +236,8 @@ impl SessionView {
 /// What differs between two sessions.
 #[derive(Debug, Serialize)]
 pub(super) struct Compared {
+    /// What is damaged of the files that were compared, in each session.
+    damage: [Vec<String>; 2],
     /// Sentences about plan, rig file, calibration and software; empty if nothing differs.
     settings: Vec<String>,
     /// Points stored, of those planned.
@@ -213,6 +247,8 @@ pub(super) struct Compared {
     products: BTreeMap<String, Difference>,
     /// Products that only one of them has, or that have another shape.
     unlike: Vec<String>,
+    /// The picture, if one was asked for.
+    pub picture: Option<PictureOfDifference>,
 }
 
 /// The difference of an image, B - A.
@@ -230,13 +266,19 @@ impl Compared {
     /// Compares two sessions.
     pub fn read(folders: [&Path; 2]) -> Result<Self, CommandFailure> {
         let [a, b] = folders;
-        let [first, second] = [SessionView::read(a)?, SessionView::read(b)?];
+        let [mut first, mut second] = [SessionView::read(a)?, SessionView::read(b)?];
         let names = |shown: &SessionView| -> BTreeSet<String> {
             let stem = |path: &PathBuf| Some(path.file_stem()?.to_str()?.to_owned());
             shown.products.iter().filter_map(stem).filter(|name| !name.ends_with("_mask")).collect()
         };
+        let found = [names(&first), names(&second)];
+        for ((dir, view), names) in folders.iter().zip([&mut first, &mut second]).zip(&found) {
+            let session = Session::open(dir).map_err(ProcessError::from)?;
+            view.check_products(&session, &names.iter().cloned().collect::<Vec<_>>())?;
+        }
+        let [of_first, of_second] = found;
         let (mut products, mut unlike) = (BTreeMap::new(), Vec::new());
-        for name in names(&first).union(&names(&second)) {
+        for name in of_first.union(&of_second) {
             match (image(a, name), image(b, name)) {
                 (Some(first), Some(second)) if first.dim() == second.dim() => {
                     products.insert(name.clone(), Difference::of(&first, &second));
@@ -247,7 +289,9 @@ impl Compared {
             }
         }
         Ok(Self {
+            damage: [first.damage, second.damage],
             settings: changes(a, b)?,
+            picture: None,
             stored: [[first.stored, first.points], [second.stored, second.points]],
             counts: [first.counts, second.counts],
             products,
@@ -288,6 +332,10 @@ impl Compared {
             title = "";
         }
         rows.extend(self.unlike.iter().map(|name| ("", format!("{name}: not in both, or of another shape"))));
+        for (which, damage) in ["A", "B"].iter().zip(&self.damage) {
+            rows.extend(damage.iter().map(|damage| ("DAMAGED", format!("in {which}, {damage}"))));
+        }
+        rows.extend(self.picture.iter().map(|picture| ("picture", picture.legend())));
         block(&rows)
     }
 }
@@ -304,9 +352,37 @@ impl Difference {
     }
 }
 
-/// A picture of a product in two sessions and of the size of their difference, side by side, as a PNG file. The first two
-/// have one scale, and the difference its own.
-pub(super) fn picture_of_difference(folders: [&Path; 2], product: &str) -> Result<Vec<u8>, CommandFailure> {
+/// What a picture of a difference shows, from left to right: A, B, and B - A.
+#[derive(Debug, Serialize)]
+pub(super) struct PictureOfDifference {
+    file: PathBuf,
+    product: String,
+    /// The product's unit; empty if its file does not say it.
+    units: String,
+    /// The value that is white in A and B.
+    white: f32,
+    /// The size of the difference at which red and blue are full.
+    full_difference: f32,
+}
+
+impl PictureOfDifference {
+    fn legend(&self) -> String {
+        let Self { file, product, units, white, full_difference } = self;
+        let units = if units.is_empty() { String::new() } else { format!("\nunit: {units}") };
+        format!(
+            "{}\n{product} of A, of B, and B - A, from left to right\nA and B: black is 0, white is {white:.3e} or more\nB - A: black is 0, red is B > A, full at +{full_difference:.3e}, blue is B < A, full at -{full_difference:.3e}{units}",
+            file.display()
+        )
+    }
+}
+
+/// Writes a picture of a product in two sessions and of their difference, side by side, as a PNG file. The first two have
+/// one scale, and the difference its own.
+pub(super) fn write_picture_of_difference(
+    folders: [&Path; 2],
+    product: &str,
+    file: PathBuf,
+) -> Result<PictureOfDifference, CommandFailure> {
     let [a, b] = folders.map(|folder| {
         image(folder, product).ok_or_else(|| {
             CommandFailure::Sessions(format!(
@@ -321,24 +397,38 @@ pub(super) fn picture_of_difference(folders: [&Path; 2], product: &str) -> Resul
             format!("{product} has {:?} pixels in one session and {:?} in the other", a.dim(), b.dim());
         return Err(CommandFailure::Sessions(message));
     }
-    let difference = (&b - &a).mapv(f32::abs);
+    let difference = &b - &a;
     let scaled = |image: &Array2<f32>, ToneMap { white }: ToneMap| image.mapv(|light| light / white);
     let common = ToneMap::percentile(&[a.view(), b.view()], PERCENTILE);
-    let own = ToneMap::percentile(&[difference.view()], PERCENTILE);
+    let own = ToneMap::percentile(&[difference.mapv(f32::abs).view()], PERCENTILE);
+    let (a, b, difference) = (scaled(&a, common), scaled(&b, common), scaled(&difference, own));
     let gap = Array2::zeros((a.nrows(), GAP_PX));
-    let images = [scaled(&a, common), gap.clone(), scaled(&b, common), gap, scaled(&difference, own)];
-    let views: Vec<_> = images.iter().map(|image| image.view()).collect();
-    let all =
-        concatenate(Axis(1), &views).map_err(|error| CommandFailure::Output(std::io::Error::other(error)))?;
-    Ok(Picture::grey(all.view(), ToneMap { white: 1.0 }).to_png().map_err(ProcessError::from)?)
+    let (positive, negative) =
+        (difference.mapv(|light| light.max(0.0)), difference.mapv(|light| -light.min(0.0)));
+    let none = Array2::zeros(a.dim());
+    let failed = |error| CommandFailure::Output(std::io::Error::other(error));
+    let channels = [&positive, &none, &negative].map(|shown| {
+        concatenate(Axis(1), &[a.view(), gap.view(), b.view(), gap.view(), shown.view()]).map_err(failed)
+    });
+    let [red, green, blue] = channels;
+    let all = stack(Axis(2), &[red?.view(), green?.view(), blue?.view()]).map_err(failed)?;
+    let png = Picture::rgb(all.view(), ToneMap { white: 1.0 }).to_png().map_err(ProcessError::from)?;
+    durable::write(&file, &png).map_err(ProcessError::from)?;
+    let about = thumbnails::about(&folders[0].join("products").join(format!("{product}.npy")));
+    Ok(PictureOfDifference {
+        file,
+        product: product.to_owned(),
+        units: about["units"].as_str().unwrap_or_default().to_owned(),
+        white: common.white,
+        full_difference: own.white,
+    })
 }
 
 /// The plan of a session and what is known of it, for the same run again.
 pub(super) fn run_again(dir: &Path) -> Result<RunParams, CommandFailure> {
     let session = Session::open(dir).map_err(ProcessError::from)?;
     let entry = session.state().map_err(ProcessError::from)?.session;
-    let path = session.plan_path();
-    let plan = fs::read_to_string(&path).map_err(|source| CommandFailure::File { path, source })?;
+    let plan = session.read_text(&session.plan_path()).map_err(ProcessError::from)?;
     Ok(RunParams {
         plan,
         operator: entry.operator,
@@ -352,8 +442,10 @@ pub(super) fn run_again(dir: &Path) -> Result<RunParams, CommandFailure> {
 /// What differs between the settings of two sessions, in a sentence each.
 pub(super) fn changes(before: &Path, after: &Path) -> Result<Vec<String>, CommandFailure> {
     let mut found = Vec::new();
+    let open = |dir| Session::open(dir).map_err(ProcessError::from);
+    let [first, second] = [open(before)?, open(after)?];
     for file in ["plan.toml", "rig.toml"] {
-        let (a, b) = (flat(&before.join(file))?, flat(&after.join(file))?);
+        let (a, b) = (flat(&first, file)?, flat(&second, file)?);
         let keys: BTreeSet<&String> = a.keys().chain(b.keys()).collect();
         for key in keys {
             match (a.get(key), b.get(key)) {
@@ -366,19 +458,18 @@ pub(super) fn changes(before: &Path, after: &Path) -> Result<Vec<String>, Comman
         }
     }
     let made = |dir| calibration_of(dir).map_or_else(|| "none".to_owned(), |made| made.to_string());
-    let software = |dir| -> Result<String, CommandFailure> {
-        let state = Session::open(dir).and_then(|session| session.state()).map_err(ProcessError::from)?;
-        Ok(state.session.software)
+    let software = |session: &Session| -> Result<String, CommandFailure> {
+        Ok(session.state().map_err(ProcessError::from)?.session.software)
     };
     let others =
-        [("calibration", made(before), made(after)), ("software", software(before)?, software(after)?)];
+        [("calibration", made(before), made(after)), ("software", software(&first)?, software(&second)?)];
     let changed = others.into_iter().filter(|(_, a, b)| a != b);
     found.extend(changed.map(|(what, a, b)| format!("{what}: {b}, was {a}")));
     Ok(found)
 }
 
-/// A TOML file's values by their keys, such as `sweep.delay_us`.
-fn flat(path: &Path) -> Result<BTreeMap<String, String>, CommandFailure> {
+/// The values of a TOML file of a session by their keys, such as `sweep.delay_us`.
+fn flat(session: &Session, file: &str) -> Result<BTreeMap<String, String>, CommandFailure> {
     fn walk(prefix: &str, value: &toml::Value, found: &mut BTreeMap<String, String>) {
         let below = |key: &str| if prefix.is_empty() { key.to_owned() } else { format!("{prefix}.{key}") };
         match value {
@@ -393,8 +484,8 @@ fn flat(path: &Path) -> Result<BTreeMap<String, String>, CommandFailure> {
             value => drop(found.insert(prefix.to_owned(), value.to_string())),
         }
     }
-    let text =
-        fs::read_to_string(path).map_err(|source| CommandFailure::File { path: path.to_owned(), source })?;
+    let path = session.dir().join(file);
+    let text = session.read_text(&path).map_err(ProcessError::from)?;
     let table: toml::Table = toml::from_str(&text).map_err(|error| {
         CommandFailure::Sessions(format!("{} cannot be read: {}", path.display(), error.message()))
     })?;
@@ -409,7 +500,8 @@ fn calibration_of(dir: &Path) -> Option<Timestamp> {
 
 /// What the transport's metadata tell of how it was made.
 fn findings_of(session: &Session) -> BTreeMap<String, String> {
-    let text = fs::read(session.products_path().join("transport.json")).unwrap_or_default();
+    let path = session.products_path().join("transport.json");
+    let text = session.read(&path, MOST_FINDINGS_BYTES).unwrap_or_default();
     let metadata: Value = serde_json::from_slice(&text).unwrap_or_default();
     let findings = metadata.get("findings").and_then(Value::as_object).into_iter().flatten();
     findings.map(|(key, said)| (key.clone(), said.as_str().unwrap_or_default().to_owned())).collect()
@@ -420,13 +512,10 @@ fn image(dir: &Path, name: &str) -> Option<Array2<f32>> {
     Session::open(dir).ok()?.products().read_image(name).ok()
 }
 
-/// All files below a folder, by name.
-fn files_below(dir: &Path) -> Vec<PathBuf> {
-    let entries = fs::read_dir(dir).into_iter().flatten().flatten().map(|entry| entry.path());
-    let mut paths: Vec<PathBuf> =
-        entries.flat_map(|path| if path.is_dir() { files_below(&path) } else { vec![path] }).collect();
-    paths.sort();
-    paths
+/// What is damaged of these files of a session, in a sentence each.
+fn damaged(session: &Session, state: &State, files: &[String]) -> Result<Vec<String>, CommandFailure> {
+    let damage = damaged_files(session, state, files).map_err(ProcessError::from)?;
+    Ok(damage.iter().map(ToString::to_string).collect())
 }
 
 #[cfg(test)]
@@ -465,7 +554,7 @@ mod tests {
         };
         for line in [
             "",
-            "--plan PAP --operator lovelace --tag b --tag a --state complete",
+            "--plan PAP --operator lovelace --tag b --tag a --state complete --kind sweep",
             "--since 2026-11-22 --until 2026-11-22",
         ] {
             assert!(keeps(line), "{line}");
@@ -476,12 +565,16 @@ mod tests {
             "--sample candle",
             "--tag a --tag c",
             "--state faulted",
+            "--kind viewfinder",
             "--since 2026-11-23",
             "--until 2026-11-21",
         ] {
             assert!(!keeps(line), "{line}");
         }
         assert!(Line::try_parse_from(["sessions", "--since", "yesterday"]).is_err());
+        let viewfinder = SessionInfo { kind: VIEWFINDER.into(), ..info() };
+        let shows = |words: &[&str]| Line::try_parse_from(words).unwrap().filter.shows(&viewfinder);
+        assert!(!shows(&["sessions"]) && shows(&["sessions", "--kind", "viewfinder"]));
     }
 
     #[test]

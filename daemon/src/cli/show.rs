@@ -11,6 +11,7 @@ use raysweep_proto::{
     PlanAdvice, Progress, Role, RunState, SessionInfo, Status,
 };
 
+use super::printer::printable;
 use raysweep_processing::Processed;
 use raysweep_session::integrity::{Audit, Damage};
 
@@ -285,17 +286,29 @@ fn short(value: f64) -> String {
     format!("{value:.*}", decimals as usize)
 }
 
-/// Text of `sessions`.
-pub(super) fn sessions(sessions: &[SessionInfo]) -> String {
-    if sessions.is_empty() {
-        return "no sessions".into();
+/// Text of `sessions`, of which so many are viewfinders that were left out.
+pub(super) fn sessions(sessions: &[SessionInfo], left_out: usize) -> String {
+    let listed = if sessions.is_empty() { "no sessions".into() } else { table_of(sessions) };
+    match left_out {
+        0 => listed,
+        1 => {
+            format!("{listed}\n1 viewfinder, which holds no images, is left out; --kind viewfinder lists it")
+        }
+        _ => format!(
+            "{listed}\n{left_out} viewfinders, which hold no images, are left out; --kind viewfinder lists them"
+        ),
     }
+}
+
+fn table_of(sessions: &[SessionInfo]) -> String {
     let row = |session: &SessionInfo| {
         let points = format!("{}/{}", session.stored, session.points);
         let folder = session.session.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let told = [session.operator.clone(), session.sample.clone(), Some(session.tags.join(", "))];
         let [operator, sample, tags] = told.map(Option::unwrap_or_default);
-        [folder, session.state.clone(), points, session.name.clone(), operator, sample, tags]
+        let row = [folder, session.state.clone(), points, session.name.clone(), operator, sample, tags];
+        // A line is a session, and columns are counted of what is printed.
+        row.map(|cell| printable(&cell).replace('\n', "\\n"))
     };
     // Folders are named after the time at which their session began.
     let heads = ["session (UTC)", "state", "stored", "name", "operator", "sample", "tags"];
@@ -351,11 +364,12 @@ impl Ending<'_> {
         let Self { session, state, report, stored, missing, final_s, light_s, simulated_time } = *self;
         let clock = if simulated_time { " (simulated time)" } else { "" };
         let mut lines = vec![match stored + missing {
-            // A viewfinder stores nothing.
-            0 => state.to_owned(),
+            0 => format!("{state}: a viewfinder stores no images"),
             points => format!("{state}: {stored} of {points} points stored, {missing} missing"),
         }];
-        lines.push(format!("session: {}", session.display()));
+        if stored + missing > 0 {
+            lines.push(format!("session: {}", session.display()));
+        }
         lines.extend(
             light_s
                 .map(|seconds| format!("{seconds:.2} s from the first to the last frame with light{clock}")),
@@ -467,7 +481,9 @@ pub(super) fn duration(seconds: f64) -> String {
 
 /// Formats rows of a label and its value.
 pub(super) fn block(rows: &[(&str, String)]) -> String {
-    rows.iter().map(|(word, text)| format!("{word:10} {text}")).collect::<Vec<_>>().join("\n")
+    // The further lines of a text are no rows.
+    let row = |(word, text): &(&str, String)| format!("{word:10} {}", text.replace('\n', "\n           "));
+    rows.iter().map(row).collect::<Vec<_>>().join("\n")
 }
 
 #[cfg(test)]

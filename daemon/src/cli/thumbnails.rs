@@ -22,10 +22,10 @@ const WHITE_PERCENT: f64 = 99.5;
 
 /// Names of the products that are pictures: those that say most, then the others, sorted.
 pub(super) fn pictures(session: &Session) -> Vec<String> {
-    let Ok(entries) = fs::read_dir(session.products_path()) else { return Vec::new() };
-    let mut names: Vec<String> = entries
-        .flatten()
-        .map(|entry| entry.path())
+    let files = session.products().files();
+    let mut names: Vec<String> = files
+        .iter()
+        .filter(|path| path.parent() == Some(&session.products_path()))
         .filter(|path| path.extension().is_some_and(|ending| ending == "npy"))
         .filter(|path| path.metadata().is_ok_and(|it| it.is_file() && it.len() <= MOST_PICTURE_BYTES))
         .filter(|path| is_picture(&about(path)))
@@ -38,7 +38,8 @@ pub(super) fn pictures(session: &Session) -> Vec<String> {
 
 /// What is known of a product; null if nothing is.
 pub(super) fn about(product: &Path) -> Value {
-    let text = input::read(&product.with_extension("json"), MOST_ABOUT_BYTES).ok();
+    let text = input::open_itself(&product.with_extension("json"), MOST_ABOUT_BYTES);
+    let text = text.and_then(|file| input::read_open(&file, MOST_ABOUT_BYTES)).ok();
     text.and_then(|text| serde_json::from_slice(&text).ok()).unwrap_or_default()
 }
 
@@ -64,12 +65,11 @@ pub(super) fn small(session: &Session, name: &str) -> raysweep_session::Result<O
 }
 
 /// Writes a small PNG file of each picture of a session into `folder`; returns their paths.
-pub(super) fn write(session: &Path, folder: &Path) -> Result<Vec<PathBuf>, CommandFailure> {
-    let session = Session::open(session).map_err(ProcessError::from)?;
+pub(super) fn write(session: &Session, folder: &Path) -> Result<Vec<PathBuf>, CommandFailure> {
     fs::create_dir_all(folder).map_err(|source| CommandFailure::Write { path: folder.to_owned(), source })?;
     let mut written = Vec::new();
-    for name in pictures(&session) {
-        let Some(png) = small(&session, &name).map_err(ProcessError::from)? else { continue };
+    for name in pictures(session) {
+        let Some(png) = small(session, &name).map_err(ProcessError::from)? else { continue };
         let path = folder.join(format!("{name}.png"));
         durable::write(&path, &png).map_err(ProcessError::from)?;
         written.push(path);

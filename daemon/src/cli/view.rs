@@ -8,7 +8,7 @@ use raysweep_core::{PointUnderWay, VsyncStats};
 use raysweep_proto::{Event, FilmEstimate, Progress, RunState, ViewfinderValues};
 
 use super::finder_text;
-use super::printer::Printer;
+use super::printer::{Printer, printable};
 use super::show::{self, Ending};
 
 /// Interval between progress lines where no bar can be drawn.
@@ -118,7 +118,7 @@ impl EventView {
                             .text()
                     }
                 };
-                writeln!(io::stdout(), "{summary}")?;
+                writeln!(io::stdout(), "{}", printable(&summary))?;
             }
             Event::Skipped { events } => {
                 self.note(&format!("{events} events were skipped because this client was too slow"))
@@ -129,6 +129,7 @@ impl EventView {
 
     /// Displays a note besides the run's events.
     pub fn note(&mut self, text: &str) {
+        let text = printable(text);
         match &self.place {
             Place::Bars { both, .. } => both.suspend(|| eprintln!("{text}")),
             Place::Lines { .. } | Place::Quiet | Place::Json => eprintln!("{text}"),

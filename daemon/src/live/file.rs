@@ -12,6 +12,7 @@ use nix::time::{ClockId, clock_gettime};
 use raysweep_proto::live::{
     DTYPE, HEADER_BYTES, MAGIC, MAX_AXES, METADATA_BYTES, NAME_BYTES, SLOT_HEADER_BYTES, VERSION,
 };
+use raysweep_session::input;
 use serde_json::{Map, Value, json};
 
 use super::LiveError;
@@ -230,7 +231,7 @@ fn remove_stale(path: &Path) -> Result<(), LiveError> {
         }
         Ok(_) => {}
     }
-    let mut file = File::open(path).map_err(failed())?;
+    let mut file = input::open_itself(path, u64::MAX).map_err(failed())?;
     let mut magic = [0; MAGIC.len()];
     if file.read_exact(&mut magic).is_err() || magic != MAGIC {
         let why = "it does not begin like one; remove it, or choose another --live".into();

@@ -9,6 +9,7 @@ use std::thread;
 use crc32fast::Hasher;
 use ndarray::ArrayD;
 use raysweep_proto::live::{DTYPE, HEADER_BYTES, MAGIC, MAX_AXES, SLOT_HEADER_BYTES, VERSION};
+use raysweep_session::input;
 use serde_json::{Map, Value};
 
 use super::LiveError;
@@ -47,7 +48,7 @@ impl LiveReader {
     /// # Errors
     /// [`LiveError::Io`] if the file cannot be read, [`LiveError::NotLive`] if it has another layout.
     pub fn open(path: &Path) -> Result<Self, LiveError> {
-        let file = File::open(path).map_err(LiveError::io("open", path))?;
+        let file = input::open(path, u64::MAX).map_err(LiveError::io("open", path))?;
         let mut header = [0; HEADER_BYTES];
         file.read_exact_at(&mut header, 0).map_err(LiveError::io("read", path))?;
         let not_live = |why: String| LiveError::NotLive { path: path.to_owned(), why };

@@ -17,6 +17,7 @@ use raysweep_core::{Camera, CameraCapabilities, Clock, DeviceError, Projector, V
 use raysweep_drivers::camera::v4l2::{self, V4l2Setup};
 use raysweep_drivers::projector::drm::{DrmConfig, DrmProjector, Timing};
 use raysweep_drivers::projector::external::{External, ShowRequest};
+use raysweep_session::input;
 use raysweep_sim::PlaneRig;
 
 use self::simulated::{Simulated, simulate};
@@ -118,6 +119,9 @@ impl SharedRig {
     }
 }
 
+/// Longest rig file that is read.
+const MOST_BYTES: u64 = 1 << 24;
+
 /// The text of a rig file and its path.
 struct Source<'a> {
     path: &'a Path,
@@ -126,7 +130,7 @@ struct Source<'a> {
 
 impl<'a> Source<'a> {
     fn read(path: &'a Path) -> Result<Self, RigError> {
-        let text = std::fs::read_to_string(path)
+        let text = input::read_text(path, MOST_BYTES)
             .map_err(|source| RigError::Read { path: path.to_owned(), source })?;
         Ok(Self { path, text })
     }

@@ -1,9 +1,12 @@
 //! `raysweep show`, `diff`, `rerun`, `note`, `trash` and `restore`, on stored sessions.
 
 use std::fs;
+use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use nix::sys::stat::Mode;
+use nix::unistd::mkfifo;
 use raysweep_session::Session;
 use raysweep_session::integrity::Audit;
 use serde_json::Value;
@@ -190,6 +193,10 @@ fn two_sessions_are_compared_by_settings_and_by_their_images() {
     let picture = data.path().join("seen.png");
     let arguments = ["diff", text(&a), text(&b), "--picture", text(&picture)];
     let out = done(&arguments);
+    assert!(
+        out.contains("red is B > A, full at +") && out.contains("A and B: black is 0, white is"),
+        "{out}"
+    );
     assert!(out.contains("stage.0.prior = \"paper\", was not given"), "{out}");
     let compared: Value = serde_json::from_str(&done(&["diff", text(&a), text(&b), "--json"])).unwrap();
     // By other means: from the files themselves.
@@ -224,4 +231,138 @@ fn a_session_is_run_again_with_its_plan_and_what_was_known_of_it() {
     );
     // The fake has no session that it could be compared with.
     assert!(String::from_utf8(output.stderr).unwrap().contains("what has changed since is not known"));
+}
+
+/// A processed session of its own.
+fn processed(data: &Path) -> PathBuf {
+    let session = stored(data, "20260101-000000_sweep");
+    done(&["process", text(&session)]);
+    session
+}
+
+fn is_gone(path: &Path) -> bool {
+    fs::symlink_metadata(path).is_err()
+}
+
+#[test]
+fn pipes_and_links_in_a_session_are_neither_waited_for_nor_followed() {
+    let data = tempfile::tempdir().unwrap();
+    let session = processed(data.path());
+    let secret = data.path().join("secret");
+    fs::write(&secret, "of somebody else").unwrap();
+    let in_place = |file: &str, put: &dyn Fn(&Path)| {
+        let (path, kept) = (session.join(file), data.path().join("kept"));
+        fs::rename(&path, &kept).unwrap();
+        put(&path);
+        let (exit, out, err) = run(&["verify", text(&session)]);
+        assert!(exit == 1 && out.contains(&format!("{file} is damaged")), "{file}: {out}{err}");
+        for (command, to) in [("show", None), ("diff", Some(text(&session)))] {
+            let words: Vec<&str> = [command, text(&session)].into_iter().chain(to).collect();
+            let (_, out, err) = run(&words);
+            assert!(!out.contains("somebody else"), "{out}");
+            // Products that are no files are not listed.
+            assert!(file.ends_with("npy") || format!("{out}{err}").contains(file), "{out}{err}");
+        }
+        let copy = data.path().join("copy");
+        run(&["export", text(&session), "--accept-damage", "--to", text(&copy)]);
+        let copied = copy.join(Path::new(file).file_name().unwrap());
+        assert!(is_gone(&copied), "{file} was copied");
+        let _ = fs::remove_dir_all(&copy);
+        fs::remove_file(&path).unwrap();
+        fs::rename(&kept, &path).unwrap();
+    };
+    for file in ["plan.toml", "rig.toml", "products/transport.json", "products/epipolar.npy"] {
+        in_place(file, &|path| mkfifo(path, Mode::S_IRWXU).unwrap());
+        in_place(file, &|path| symlink(&secret, path).unwrap());
+        in_place(file, &|path| symlink("/dev/zero", path).unwrap());
+    }
+    let pipe = data.path().join("pipe");
+    mkfifo(&pipe, Mode::S_IRWXU).unwrap();
+    for words in [["check", text(&pipe)].as_slice(), &["park", "--state", text(&pipe)]] {
+        let (exit, _, err) = run(words);
+        assert!(exit != 0 && err.contains("not a regular file"), "{words:?}: {err}");
+    }
+    // A whole folder, too.
+    let products = session.join("products");
+    fs::rename(&products, data.path().join("elsewhere")).unwrap();
+    symlink(data.path().join("elsewhere"), &products).unwrap();
+    let shown = run(&["show", text(&session)]).1;
+    assert!(!shown.contains("epipolar.npy"), "{shown}");
+    assert_eq!(run(&["verify", text(&session)]).0, 1);
+}
+
+#[test]
+fn what_is_shown_of_damaged_files_is_said_to_be_damaged() {
+    let data = tempfile::tempdir().unwrap();
+    let session = processed(data.path());
+    assert!(!done(&["show", text(&session)]).contains("DAMAGED"));
+    let image = session.join("products/epipolar.npy");
+    let mut bytes = fs::read(&image).unwrap();
+    *bytes.last_mut().unwrap() ^= 1;
+    fs::write(&image, bytes).unwrap();
+    let out = done(&["diff", text(&session), text(&session)]);
+    assert!(out.contains("DAMAGED    in A, products/epipolar.npy is damaged"), "{out}");
+    let plan = session.join("plan.toml");
+    fs::write(&plan, fs::read_to_string(&plan).unwrap() + "\n").unwrap();
+    let out = done(&["show", text(&session)]);
+    assert!(out.contains("DAMAGED    plan.toml is damaged"), "{out}");
+    // In a copy, the session is what is damaged.
+    let chunk = fs::read_dir(session.join("stack.zarr/sum")).unwrap().map(|entry| entry.unwrap().path());
+    let chunk = chunk.filter(|path| path.extension().is_none_or(|ending| ending != "json")).min().unwrap();
+    fs::write(&chunk, "torn").unwrap();
+    let (_, _, err) = run(&["process", text(&session), "--to", text(&data.path().join("copy"))]);
+    assert!(err.contains(&format!("{} is damaged", session.display())), "{err}");
+}
+
+#[test]
+fn what_others_wrote_into_a_session_does_not_control_the_terminal() {
+    let data = tempfile::tempdir().unwrap();
+    let session = processed(data.path());
+    done(&["note", text(&session), "\u{1b}[2Jgone \u{202e}live\nstate      complete", "--by", "\u{9b}1mEve"]);
+    let shown = done(&["show", text(&session)]);
+    assert!(shown.contains("\\u{9b}1mEve: \\u{1b}[2Jgone \\u{202e}live\n           state "), "{shown}");
+    assert!(!shown.contains(['\u{1b}', '\u{9b}', '\u{202e}']), "{shown}");
+}
+
+#[test]
+fn nothing_is_copied_into_the_session_itself_and_half_a_copy_is_none() {
+    let data = tempfile::tempdir().unwrap();
+    let session = processed(data.path());
+    let link = data.path().join("link");
+    symlink(&session, &link).unwrap();
+    let before = fs::read_dir(&session).unwrap().count();
+    for to in [session.join("copy"), session.join("products/../copy"), link.join("copy")] {
+        for command in
+            [&["process"][..], &["export"], &["export", "--format", "zip"], &["export", "--format", "png"]]
+        {
+            let words = [command, &[text(&session), "--to", text(&to)]].concat();
+            let (exit, _, err) = run(&words);
+            assert!(exit != 0 && err.contains("is in the session itself"), "{words:?}: {err}");
+        }
+    }
+    assert_eq!(fs::read_dir(&session).unwrap().count(), before);
+    // A description that cannot be read is found after others were copied.
+    fs::write(session.join("products/regular.json"), "{").unwrap();
+    let to = data.path().join("copy");
+    let words = ["export", text(&session), "--accept-damage", "--format", "npy", "--to", text(&to)];
+    assert_ne!(run(&words).0, 0);
+    assert!(is_gone(&to));
+    let left: Vec<_> = fs::read_dir(data.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    assert_eq!(left.len(), 2, "{left:?}");
+}
+
+#[test]
+fn a_trash_that_leads_elsewhere_is_refused() {
+    let data = tempfile::tempdir().unwrap();
+    let session = stored(data.path(), "20260101-000000_sweep");
+    let elsewhere = data.path().join("elsewhere/.trash");
+    fs::create_dir_all(&elsewhere).unwrap();
+    symlink(&elsewhere, data.path().join(".trash")).unwrap();
+    let (exit, _, err) = run(&["trash", text(&session)]);
+    assert!(exit == 1 && err.contains("not a folder itself"), "{err}");
+    assert!(session.exists());
+    let other = stored(&elsewhere, "20260102-000000_sweep");
+    let given = data.path().join(".trash/20260102-000000_sweep");
+    let (exit, _, err) = run(&["restore", text(&given)]);
+    assert!(exit == 1 && err.contains("not a folder itself") && other.exists(), "{err}");
 }

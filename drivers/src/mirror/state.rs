@@ -177,17 +177,26 @@ impl StateFile {
 }
 
 fn read(path: &Path) -> Result<Option<(MirrorState, Sent)>, StateError> {
-    let text = match fs::read(path) {
+    let text = match read_regular(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
         read => read.map_err(StateError::io("read", path))?,
     };
     let state = serde_json::from_slice(&text)
         .map_err(|source| StateError::Damaged { path: path.to_owned(), source })?;
     let sent_path = beside(path, "sent");
-    let sent = fs::read_to_string(&sent_path).map_err(StateError::io("read", &sent_path))?;
+    let sent = read_regular(&sent_path).map_err(StateError::io("read", &sent_path))?;
+    let sent = String::from_utf8_lossy(&sent);
     let mut numbers = sent.split_whitespace().map(|number| number.parse().unwrap_or(0));
     let mut next = || numbers.next().unwrap_or(0);
     Ok(Some((state, Sent { certainly: next(), possibly: next() })))
+}
+
+/// Reads a file that somebody may have named: a pipe would block, a device has no end.
+fn read_regular(path: &Path) -> io::Result<Vec<u8>> {
+    match fs::metadata(path)?.is_file() {
+        true => fs::read(path),
+        false => Err(io::Error::new(io::ErrorKind::InvalidInput, "it is not a regular file")),
+    }
 }
 
 /// `NAME.extension`: appended, so that the files of two mirrors never clash.

@@ -1,12 +1,13 @@
 //! The daemon's side of the socket: devices of a rig that another process simulates.
 
 use std::io::{BufRead, BufReader, ErrorKind, Read, Write};
+use std::os::unix::fs::MetadataExt;
 use std::os::unix::net::UnixStream;
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use raysweep_core::{DeviceError, DeviceErrorKind, Edge, Pattern, Projector, Shown, Vsync};
+use raysweep_core::{DeviceError, DeviceErrorKind, Edge, Pattern, Projector, Shown, Vsync, io_text};
 
 use super::{MAX_LINE, Reply, Request, Truth};
 use crate::gige::Faults;
@@ -22,10 +23,25 @@ struct Connection {
     text: Vec<u8>,
 }
 
+/// Whose a socket is that this process may not use, and what to do.
+fn owner_advice(path: &Path) -> String {
+    match path.metadata() {
+        Ok(found) => format!(
+            "it belongs to user {}: start raysweep-sim-camera as the user who runs raysweepd, or let that user write to it",
+            found.uid()
+        ),
+        Err(_) => "no access to its folder: name another place in the rig file, for both programs".into(),
+    }
+}
+
 impl Connection {
     fn open(device: &'static str, path: &Path) -> Result<Self, DeviceError> {
         let stream = UnixStream::connect(path).map_err(|error| {
-            let what = format!("sim.bench = {}: {error}: start raysweep-sim-camera first", path.display());
+            let advice = match error.kind() {
+                ErrorKind::PermissionDenied => owner_advice(path),
+                _ => "start raysweep-sim-camera first".into(),
+            };
+            let what = format!("sim.bench = {}: {}: {advice}", path.display(), io_text(&error));
             DeviceError::new(device, DeviceErrorKind::Disconnected, what)
         })?;
         Ok(Self { device, reader: BufReader::new(stream), text: Vec::new() })

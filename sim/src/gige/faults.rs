@@ -61,6 +61,26 @@ impl Default for Faults {
     }
 }
 
+impl Faults {
+    /// Checks that fractions are fractions.
+    ///
+    /// # Errors
+    /// Which one is not, and what is allowed.
+    pub fn check(&self) -> Result<(), String> {
+        let Self { packet_loss, duplication, reordering, frame_loss, .. } = *self;
+        let fractions = [
+            ("packet_loss", packet_loss),
+            ("duplication", duplication),
+            ("reordering", reordering),
+            ("frame_loss", frame_loss),
+        ];
+        match fractions.iter().find(|(_, fraction)| !(0.0..=1.0).contains(fraction)) {
+            Some((name, fraction)) => Err(format!("{name} = {fraction}: must be from 0 to 1")),
+            None => Ok(()),
+        }
+    }
+}
+
 /// Ground truth of what the camera sent, for tests only.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct WireTruth {

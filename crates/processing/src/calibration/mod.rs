@@ -208,7 +208,7 @@ pub fn process(
     let refused = |error: CalibrationError| ProcessError::Config(error.to_string());
     let stack = session.stack()?;
     let findings = BoardFindings::new(&BoardImages { task: &task, state, stack: &stack }).map_err(refused)?;
-    let rig_text = crate::stored::read(&session.rig_path())?;
+    let rig_text = session.read_text(&session.rig_path())?;
     // Only a run knows the camera itself.
     let camera = before.map_or_else(String::new, |before| before.header.valid_for.camera);
     let kept = findings.keep(session, state, ValidFor::new(&rig, &rig_text, &camera, size))?;

@@ -1,20 +1,20 @@
 //! Products in the formats of other programs.
 
 use std::fmt::Write as _;
-use std::fs::File;
+use std::fs::{File, FileType};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 use ndarray::{Array2, ArrayD, ArrayView3, ArrayViewD, Axis, Ix3};
-use raysweep_session::Session;
 use raysweep_session::report::{Picture, ToneMap};
+use raysweep_session::{Session, durable};
 use serde_json::Value;
 use tiff::encoder::{TiffEncoder, TiffValue, colortype};
 use tiff::tags::Tag;
 use zip::write::SimpleFileOptions;
 
 use super::mat::{variable_name, write_header, write_variable};
-use super::{ExportScope, copy, create_new, listed, not_copied};
+use super::{ExportScope, copy, in_new_folder, is_real, listed, not_copied};
 use crate::stored::ProcessError;
 
 /// A format in which products can be exported.
@@ -92,18 +92,21 @@ pub fn export_as(
     if !accept_damage {
         super::check_sound(&session)?;
     }
-    create_new(to)?;
-    let products = described(&session)?;
-    let mut readme = beginning(&session, format);
+    in_new_folder(&session, to, |to| export_into(&session, to, format))
+}
+
+fn export_into(session: &Session, to: &Path, format: ExportFormat) -> Result<usize, ProcessError> {
+    let products = described(session)?;
+    let mut readme = beginning(session, format);
     let mut mat = match format {
-        ExportFormat::Mat => Some(MatFile::create(&to.join("products.mat"), &session)?),
+        ExportFormat::Mat => Some(MatFile::create(&to.join("products.mat"), session)?),
         _ => None,
     };
     let mut files = 0;
     for product in &products {
         let exported = match &mut mat {
-            Some(mat) => mat.append(&session, product)?,
-            None => written(&session, product, to, format)?,
+            Some(mat) => mat.append(session, product)?,
+            None => written(session, product, to, format)?,
         };
         let Described { name, axes, units, about, .. } = product;
         let axes = axes.join(", ");
@@ -127,14 +130,13 @@ pub fn export_as(
 /// The products of a session, by name.
 fn described(session: &Session) -> Result<Vec<Described>, ProcessError> {
     let mut products = Vec::new();
-    let mut paths = listed(&session.products_path());
-    paths.sort();
+    let paths = session.products().files();
     for path in paths.iter().filter(|path| path.extension().is_some_and(|ending| ending == "json")) {
         let Some(name) = path.file_stem().and_then(|name| name.to_str()) else { continue };
-        if !path.with_extension("npy").is_file() {
+        if !is_real(&path.with_extension("npy"), FileType::is_file) {
             continue;
         }
-        let text = std::fs::read_to_string(path).map_err(not_copied(path))?;
+        let text = session.read_text(path)?;
         let value: Value = serde_json::from_str(&text)
             .map_err(|error| ProcessError::Config(format!("cannot read {}: {error}", path.display())))?;
         let said = |key: &str| value[key].as_str().unwrap_or_default().to_owned();
@@ -186,19 +188,20 @@ fn written(
     let own = |ending: &str| session.products_path().join(format!("{name}{ending}"));
     let copied = |ending: &str| {
         let target = to.join(format!("{name}{ending}"));
-        copy(&own(ending), &target).map(|()| Exported { file: format!("{name}{ending}"), scale: "1".into() })
+        copy(session, &own(ending), &target)
+            .map(|()| Exported { file: format!("{name}{ending}"), scale: "1".into() })
     };
-    if own(".csv").is_file() && format != ExportFormat::Npy {
+    if is_real(&own(".csv"), FileType::is_file) && format != ExportFormat::Npy {
         return copied(".csv").map(Some);
     }
     match format {
         ExportFormat::Npy => {
-            if own("_mask.npy").is_file() {
+            if is_real(&own("_mask.npy"), FileType::is_file) {
                 copied("_mask.npy")?;
             }
             copied(".npy").map(Some)
         }
-        ExportFormat::Exr if own(".exr").is_file() => copied(".exr").map(Some),
+        ExportFormat::Exr if is_real(&own(".exr"), FileType::is_file) => copied(".exr").map(Some),
         ExportFormat::Png | ExportFormat::Tiff16 | ExportFormat::Tiff32 => {
             let Some(images) = images(session, product)? else { return Ok(None) };
             match format {
@@ -350,34 +353,26 @@ impl MatFile {
 
 /// Copies a session into a new archive.
 fn archive(dir: &Path, to: &Path, accept_damage: bool, scope: ExportScope) -> Result<usize, ProcessError> {
-    if to.exists() {
-        return Err(ProcessError::Config(format!("{} already exists: give a new file", to.display())));
-    }
+    super::check_new(&Session::open(dir)?, to, "file")?;
     let mut name = to.file_name().unwrap_or_default().to_owned();
     name.push(".partial");
     let folder = to.with_file_name(name);
-    let files = super::export(dir, &folder, accept_damage, scope);
-    let zipped = files.and_then(|files| zip_folder(&folder, to).map(|()| files).map_err(not_copied(to)));
-    let removed = if folder.exists() { std::fs::remove_dir_all(&folder) } else { Ok(()) };
-    if zipped.is_err() {
-        // Half of an archive is none.
-        let _ = std::fs::remove_file(to);
-    }
-    zipped.and_then(|files| removed.map(|()| files).map_err(not_copied(&folder)))
+    let files = super::export(dir, &folder, accept_damage, scope)?;
+    let zipped = durable::write_with(to, |file| zip_folder(&folder, file));
+    let removed = std::fs::remove_dir_all(&folder).map_err(not_copied(&folder));
+    zipped?;
+    removed.map(|()| files)
 }
 
-fn zip_folder(folder: &Path, to: &Path) -> io::Result<()> {
-    let mut archive = zip::ZipWriter::new(BufWriter::new(File::create_new(to)?));
+fn zip_folder(folder: &Path, to: &mut File) -> io::Result<()> {
+    let mut archive = zip::ZipWriter::new(BufWriter::new(to));
     let options = SimpleFileOptions::default().large_file(true);
     let mut folders = vec![folder.to_owned()];
     while let Some(inner) = folders.pop() {
-        let mut paths = listed(&inner);
+        folders.extend(listed(&inner, FileType::is_dir));
+        let mut paths = listed(&inner, FileType::is_file);
         paths.sort();
         for path in paths {
-            if path.is_dir() {
-                folders.push(path);
-                continue;
-            }
             let name = path.strip_prefix(folder).map_err(io::Error::other)?;
             archive.start_file_from_path(name, options).map_err(io::Error::other)?;
             io::copy(&mut File::open(&path)?, &mut archive)?;

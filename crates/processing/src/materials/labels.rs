@@ -1,10 +1,10 @@
 //! What each pixel shows, as a person has marked it.
 
-use std::fs::File;
 use std::io::BufReader;
 use std::path::Path;
 
 use ndarray::Array2;
+use raysweep_core::io_text;
 use raysweep_session::input;
 use serde::Deserialize;
 
@@ -118,7 +118,7 @@ impl Labels {
 /// The values of an 8-bit image with one channel.
 fn read_png(path: &Path, size: (usize, usize)) -> Result<Array2<u8>, ProcessError> {
     let wrong = |what: String| ProcessError::Config(format!("{}: {what}", path.display()));
-    let file = File::open(path).map_err(|error| wrong(error.to_string()))?;
+    let file = input::open(path, u64::MAX).map_err(|error| wrong(io_text(&error)))?;
     let mut decoder = png::Decoder::new_with_limits(BufReader::new(file), png::Limits { bytes: 1 << 28 });
     decoder.set_transformations(png::Transformations::IDENTITY);
     let mut reader = decoder.read_info().map_err(|error| wrong(error.to_string()))?;

@@ -7,7 +7,7 @@ use raysweep_config::{Plan, Procedure};
 use raysweep_session::{STRIP_ROWS, Session, transport};
 use serde::{Deserialize, Serialize};
 
-use crate::stored::{ProcessError, read};
+use crate::stored::ProcessError;
 
 /// In what distances are counted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -70,7 +70,7 @@ impl Transported {
         let session = Session::open(dir)?;
         let wrong = |what: String| ProcessError::Config(format!("{}: {what}", dir.display()));
         let plan_path = session.plan_path();
-        let text = read(&plan_path)?;
+        let text = session.read_text(&plan_path)?;
         let plan = Plan::parse_stored(&text)
             .map_err(|error| ProcessError::Config(error.render(&plan_path.display().to_string(), &text)))?;
         let Procedure::Sweep(own) = plan.procedure else {

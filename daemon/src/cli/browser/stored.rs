@@ -1,13 +1,11 @@
 //! What the page shows of sessions on disk.
 
-use std::fs::File;
-use std::io::Read;
 use std::path::Path;
 
 use raysweep_config::Plan;
 use raysweep_session::ledger::PointEntry;
 use raysweep_session::stack::{ArrayName, Contents};
-use raysweep_session::{Session, input, transport};
+use raysweep_session::{Session, transport};
 use serde_json::{Value, json};
 
 use super::super::sessions::SessionView;
@@ -16,8 +14,6 @@ use super::pictures::Encoded;
 
 /// Largest report, in bytes.
 const MOST_REPORT_BYTES: u64 = 1 << 28;
-/// Largest plan, in bytes.
-const MOST_PLAN_BYTES: u64 = 1 << 20;
 
 fn told(error: impl std::fmt::Display) -> String {
     error.to_string()
@@ -25,26 +21,28 @@ fn told(error: impl std::fmt::Display) -> String {
 
 /// A session as `raysweep show --json` shows it, with the names of the products that are pictures, the best first.
 pub(super) fn session(folder: &Path) -> Result<Value, String> {
-    let mut view = serde_json::to_value(SessionView::read(folder).map_err(told)?).map_err(told)?;
+    let mut view = SessionView::read(folder).map_err(told)?;
     let session = Session::open(folder).map_err(told)?;
-    view["images"] = json!(pictures(&session));
+    let images = pictures(&session);
+    view.check_products(&session, &images).map_err(told)?;
+    let mut view = serde_json::to_value(view).map_err(told)?;
+    view["images"] = json!(images);
     view["has_transport"] = json!(session.transport_path().exists());
-    let plan = input::read(&session.plan_path(), MOST_PLAN_BYTES).map_err(told)?;
+    let plan = session.read_text(&session.plan_path()).map_err(told)?;
     let is_whole = view["state"] == "complete" && view["stored"] == view["points"];
-    let plan = Plan::parse_stored(&String::from_utf8_lossy(&plan));
+    let plan = Plan::parse_stored(&plan);
     view["can_resume"] = json!(!is_whole && plan.is_ok_and(|plan| plan.procedure.past().is_none()));
     Ok(view)
 }
 
 /// The report.
 pub(super) fn report(folder: &Path) -> Result<Vec<u8>, String> {
-    let path = Session::open(folder).map_err(told)?.report_path();
-    let file = File::open(&path).map_err(|_none| {
-        "this session has no report: `raysweep process` makes one of what is stored".to_owned()
-    })?;
-    let mut page = Vec::new();
-    file.take(MOST_REPORT_BYTES).read_to_end(&mut page).map_err(told)?;
-    Ok(page)
+    let session = Session::open(folder).map_err(told)?;
+    let path = session.report_path();
+    if !path.exists() {
+        return Err("this session has no report: `raysweep process` makes one of what is stored".to_owned());
+    }
+    session.read(&path, MOST_REPORT_BYTES).map_err(told)
 }
 
 /// A product that is a picture.

@@ -7,6 +7,7 @@ mod plane;
 mod questions;
 mod text;
 
+use std::fs;
 use std::path::{Path, PathBuf};
 
 use raysweep_config::rig::AnyRigFile;
@@ -20,7 +21,7 @@ use self::found::{ConnectedDevices, answer_text};
 use self::questions::{AnswerChoice, Questions};
 use super::exit::Exit;
 use super::failure::CommandFailure;
-use super::printer::Printer;
+use super::printer::{Printer, printable};
 
 /// A first sweep: the paper's settings with few frames each, so that something is seen soon. Fewer settings do not tell
 /// the pixel's own row from the rows beside it, and reach less of the light.
@@ -48,12 +49,12 @@ pub struct SetupFiles<'a> {
 pub fn setup(files: &SetupFiles<'_>, printer: Printer) -> Result<Exit, CommandFailure> {
     let SetupFiles { answers, rig, plan, force } = *files;
     // Before anything is asked: answers should not be lost.
-    [rig, plan].into_iter().try_for_each(|path| may_write(path, force))?;
+    may_write([rig, plan], force)?;
     let mut questions = Questions::of(answers)?;
     let mut connected = ConnectedDevices::search();
     let is_spoken = !printer.json;
     if is_spoken {
-        println!("{}", connected.text());
+        println!("{}", printable(&connected.text()));
     }
     ask_ports(&mut questions, &mut connected, is_spoken)?;
     let kinds = [
@@ -68,11 +69,10 @@ pub fn setup(files: &SetupFiles<'_>, printer: Printer) -> Result<Exit, CommandFa
     questions.finish()?;
     check(rig, &rig_text, AnyRigFile::parse(&rig_text).map(drop))?;
     check(plan, &plan_text, Plan::parse(&plan_text).map(drop))?;
-    for (path, text) in [(rig, &rig_text), (plan, &plan_text)] {
-        // It may have been made while the questions were asked.
-        may_write(path, force)?;
-        durable::write(path, text.as_bytes()).map_err(ProcessError::from)?;
-    }
+    // They may have been made while the questions were asked.
+    may_write([rig, plan], force)?;
+    durable::write_all(&[(rig, rig_text.as_bytes()), (plan, plan_text.as_bytes())])
+        .map_err(ProcessError::from)?;
     let value = json!({ "rig": rig, "plan": plan, "connected": connected });
     printer.print(&value, |_| {
         format!(
@@ -99,7 +99,7 @@ fn ask_ports(
     for port in chosen {
         let answer = ask(&port);
         if is_spoken {
-            println!("{}: {}", port.display(), answer_text(answer.as_ref()));
+            println!("{}: {}", port.display(), printable(&answer_text(answer.as_ref())));
         }
         connected.answering.push((port, answer));
     }
@@ -114,12 +114,35 @@ fn check(path: &Path, text: &str, parsed: Result<(), ConfigError>) -> Result<(),
     })
 }
 
-fn may_write(path: &Path, force: bool) -> Result<(), CommandFailure> {
-    match !force && path.exists() {
+/// Refuses files that must not be written. What is no regular file would be replaced by one, even a device.
+fn may_write(files: [&Path; 2], force: bool) -> Result<(), CommandFailure> {
+    let refused = |what: String| Err(CommandFailure::Setup(what));
+    for path in files {
+        let shown = path.display();
+        match fs::symlink_metadata(path) {
+            Ok(found) if !found.is_file() => {
+                return refused(format!(
+                    "{shown} is not a regular file: name another one with --rig or --plan"
+                ));
+            }
+            Ok(_) if !force => {
+                return refused(format!(
+                    "{shown} is there already: name another file with --rig or --plan, or replace it with --force"
+                ));
+            }
+            _ => {}
+        }
+    }
+    // Both may be new, so only their folders can be looked up.
+    let [rig, plan] = files.map(|path| {
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        (fs::canonicalize(folder).unwrap_or_else(|_| folder.to_owned()), path.file_name())
+    });
+    match rig == plan {
+        true => refused(format!(
+            "--rig and --plan both name {}: give two files, one for each",
+            files[0].display()
+        )),
         false => Ok(()),
-        true => Err(CommandFailure::Setup(format!(
-            "{} is there already: name another file with --rig or --plan, or replace it with --force",
-            path.display()
-        ))),
     }
 }

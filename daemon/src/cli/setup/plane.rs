@@ -1,5 +1,6 @@
 //! The questions about a plane rig.
 
+use std::ops::RangeInclusive;
 use std::path::PathBuf;
 
 use raysweep_drivers::search::Answering;
@@ -13,7 +14,9 @@ use crate::cli::failure::CommandFailure;
 
 /// Lines of a video frame for each line that is drawn, and lines before the first one: those of 720p60.
 const LINES_PER_ROW: f64 = 750.0 / 720.0;
-const LINES_BEFORE: f64 = 25.0;
+/// Of the lines without a row, the part that is before the first one.
+const BEFORE_PER_ROW: f64 = 25.0 / 720.0;
+const ROW_TIME_US: RangeInclusive<f64> = 0.1..=10_000.0;
 
 const SIM: &str = "sim";
 const BENCH: &str = "bench";
@@ -28,16 +31,17 @@ pub(super) fn ask(questions: &mut Questions, connected: &ConnectedDevices) -> Re
     let vsync = ask_vsync(questions, connected, &camera)?;
     let period_us = 1e6 / rate_hz;
     let row_time_us = period_us / (f64::from(rows) * LINES_PER_ROW);
+    let row_time_us = row_time_us.clamp(*ROW_TIME_US.start(), *ROW_TIME_US.end());
     let row_time_us = questions.number(
         "row_time_us",
         "Microseconds from one row of the projector to the next (`raysweep calibrate` measures it)",
         rounded(row_time_us),
-        0.1..=10_000.0,
+        ROW_TIME_US,
     )?;
     let first_row_us = questions.number(
         "first_row_us",
         "Microseconds from the VSYNC edge to the first row (`raysweep calibrate` measures it)",
-        rounded(LINES_BEFORE * row_time_us).min(period_us),
+        rounded(BEFORE_PER_ROW * f64::from(rows) * row_time_us).min(period_us),
         0.0..=rounded(period_us),
     )?;
     let text = camera.write(RigText::new("plane"));

@@ -1,7 +1,6 @@
 //! Questions to an operator at a terminal, or to a file of answers.
 
 use std::fmt::Write as _;
-use std::fs;
 use std::io::{self, BufRead, IsTerminal, Write};
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
@@ -9,6 +8,7 @@ use std::path::{Path, PathBuf};
 use toml::{Table, Value};
 
 use crate::cli::failure::CommandFailure;
+use crate::cli::plan_file::read_small;
 
 /// An answer that may be chosen.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -50,12 +50,11 @@ impl Questions {
                 false => refused("nobody to ask: call it at a terminal, or give --answers FILE"),
             };
         };
-        let text = fs::read_to_string(path)
-            .map_err(|source| CommandFailure::File { path: path.to_owned(), source })?;
+        let text = read_small(path)?;
         let parsed: Result<Table, _> = text.parse();
         match parsed {
             Ok(answers) => Ok(Self::File { path: path.to_owned(), answers }),
-            Err(error) => refused(format!("{}: {error}", path.display())),
+            Err(error) => refused(format!("{}: {}", path.display(), in_place(&text, &error))),
         }
     }
 
@@ -82,7 +81,7 @@ impl Questions {
             let given = self.given(key, "a string", |value| value.as_str().map(str::to_owned))?;
             return match given.or_else(|| default.map(str::to_owned)) {
                 Some(value) if fits(&value) => Ok(value),
-                Some(value) => refused(format!("{}{key} = {value:?}; {allowed}", self.place())),
+                Some(value) => refused(format!("{}{key} = {:?}; {allowed}", self.place(), short(&value))),
                 None => refused(format!("{}{key} is missing: {question}; {allowed}", self.place())),
             };
         }
@@ -173,7 +172,7 @@ impl Questions {
                 Some(path) => refused(format!(
                     "{}{key}: {}: there is no such file; allowed: paths of serial ports, such as /dev/ttyUSB0",
                     self.place(),
-                    path.display()
+                    short(&path.to_string_lossy())
                 )),
                 None => Ok(paths),
             };
@@ -208,7 +207,7 @@ impl Questions {
         match &self {
             Self::File { answers, .. } if !answers.is_empty() => {
                 let keys: Vec<&str> = answers.keys().map(String::as_str).collect();
-                let keys = keys.join(", ");
+                let keys = short(&keys.join(", "));
                 refused(format!("{}{keys}: not asked for with the other answers; remove it", self.place()))
             }
             _ => Ok(()),
@@ -222,7 +221,7 @@ impl Questions {
         let Some(value) = answers.remove(key) else { return Ok(None) };
         match read(&value) {
             Some(given) => Ok(Some(given)),
-            None => refused(format!("{place}{key} = {value}; allowed: {wanted}")),
+            None => refused(format!("{place}{key} = {}; allowed: {wanted}", short(&value.to_string()))),
         }
     }
 
@@ -232,6 +231,25 @@ impl Questions {
             Self::Terminal => String::new(),
         }
     }
+}
+
+/// Most characters of a value that a message repeats.
+const MOST_SHOWN: usize = 80;
+
+/// A value as a message repeats it.
+fn short(value: &str) -> String {
+    match value.char_indices().nth(MOST_SHOWN) {
+        Some((end, _)) => format!("{}…", &value[..end]),
+        None => value.to_owned(),
+    }
+}
+
+/// What is wrong with a TOML text, and where. The error's own text repeats the whole line.
+fn in_place(text: &str, error: &toml::de::Error) -> String {
+    let before = error.span().and_then(|span| text.get(..span.start));
+    let line =
+        before.map_or_else(String::new, |before| format!("line {}: ", before.matches('\n').count() + 1));
+    format!("{line}{}", error.message())
 }
 
 /// One line of the person at the terminal; nothing stands for the default.
@@ -291,6 +309,8 @@ mod tests {
         let whole = |text: &str| questions(text).whole("rows", "Rows?", 720, 1..=8192);
         assert_eq!(whole("rows = 360.0").unwrap(), 360);
         assert!(message(whole("rows = 1.5")).contains("allowed: whole numbers, 1 to 8192"));
+        let long = message(choose(&format!("vsync = '{}'", "x".repeat(1 << 20)), None));
+        assert!(long.len() < 300 && long.contains("xxx…"), "{} bytes", long.len());
         assert!(message(questions("colour = 'red'").finish()).contains("colour: not asked for"));
     }
 }

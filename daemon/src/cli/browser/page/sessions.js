@@ -94,6 +94,7 @@ export function startSessions({ watch }) {
           images.length ? menu : null, one.report ? link(first, two ? "report of the first" : "report") : null,
           two?.report ? link(second, "report of the second") : null,
           !two && one.can_resume ? resume(first, place) : null),
+        ...[one, two].filter(Boolean).flatMap(({ damage }) => damage.map((what) => note("warn", what))),
         ...(two ? [] : [figures(one)]), sides, plot);
       const pixel = profile(plot, [one, two].filter(Boolean));
       const draw = () => pictures(sides, [first, second], menu, pixel);
