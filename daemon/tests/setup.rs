@@ -157,7 +157,13 @@ fn wrong_answers_write_nothing_and_name_what_is_allowed() {
         ("camera = 'sim'\nprojector = 'sim'\nvsync = 'sim'\nprojector_rows = 1.5", "whole numbers"),
         ("camera = ", "answers.toml"),
         ("camera = 'sim'\nask_ports = ['132']", "ask_ports: 132: there is no such file"),
-        ("kind = 'dots'\ncamera = 'sim'\nmirror = 'optotune:/dev/null'", "laser_port is missing"),
+        ("camera = 'sim'\nask_ports = ['answers.toml']", "ask_ports: answers.toml: this is no serial port"),
+        (
+            "camera = 'v4l2:/none'\ncontrols = 'gain'",
+            "controls = \"gain\": \"gain\" is not NAME=WHOLE NUMBER",
+        ),
+        ("camera = 'v4l2:/none'\npixel_format = 'Mono13'", "pixel_format = \"Mono13\": "),
+        ("kind = 'dots'\ncamera = 'sim'\nmirror = 'optotune:/dev/null'", "laser_port = \"\": an Optotune"),
     ] {
         let output = setup(folder.path(), answers);
         let error: Value = serde_json::from_slice(&output.stdout).unwrap();
@@ -174,6 +180,19 @@ fn wrong_answers_write_nothing_and_name_what_is_allowed() {
     let mut nobody = Command::new(env!("CARGO_BIN_EXE_raysweep"));
     let output = nobody.arg("setup").current_dir(folder.path()).stdin(Stdio::null()).output().unwrap();
     assert!(String::from_utf8_lossy(&output.stderr).contains("--answers"));
+}
+
+#[test]
+fn a_kernels_camera_with_a_trigger_can_run_freely_for_a_viewfinder() {
+    let folder = tempfile::tempdir().unwrap();
+    let answers = "camera = 'v4l2:/none'\ncontrols = 'trigger_mode=1, gain=0'\nprojector = 'external'\nvsync = 'pps:/dev/pps0'\n";
+    let text = |answers: &str| {
+        written(&forced(folder.path(), answers));
+        fs::read_to_string(folder.path().join("new-rig.toml")).unwrap()
+    };
+    assert!(text(answers).contains("free_running = [[\"trigger_mode\", 0]]"), "{}", text(answers));
+    let own = format!("{answers}free_running = 'trigger_mode=2'\n");
+    assert!(text(&own).contains("free_running = [[\"trigger_mode\", 2]]"), "{}", text(&own));
 }
 
 #[test]

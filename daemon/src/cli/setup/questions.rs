@@ -4,8 +4,10 @@ use std::fmt::Write as _;
 use std::fs;
 use std::io::{self, BufRead, IsTerminal, Write};
 use std::ops::RangeInclusive;
+use std::os::unix::fs::{FileTypeExt, MetadataExt};
 use std::path::{Path, PathBuf};
 
+use nix::sys::stat;
 use toml::{Table, Value};
 
 use crate::cli::failure::CommandFailure;
@@ -72,8 +74,10 @@ impl Questions {
         let fits = |value: &str| {
             choices.iter().any(|choice| choice.value == value)
                 || forms.iter().any(|form| {
-                    let kind = form.split_once(':').map_or(*form, |(kind, _)| kind);
-                    value.split_once(':').is_some_and(|(of, name)| of == kind && !name.is_empty())
+                    let parts: Vec<&str> = value.splitn(form.split(':').count(), ':').collect();
+                    parts.len() > 1
+                        && form.split(':').next() == parts.first().copied()
+                        && parts.iter().all(|part| !part.is_empty())
                 })
         };
         let values = choices.iter().map(|choice| choice.value.as_str()).chain(forms.iter().copied());
@@ -160,20 +164,41 @@ impl Questions {
         asked(&format!("{question}\n"), Some(default))
     }
 
-    /// Asks which paths to take, none by default; `choices` are those that were found.
-    pub fn paths(&mut self, key: &str, question: &str, choices: &[PathBuf]) -> Answer<Vec<PathBuf>> {
-        let missing = |paths: &[PathBuf]| paths.iter().find(|path| !path.exists()).cloned();
+    /// Asks for a text that means something: `read` says what, or what is wrong with it.
+    pub fn read<T>(
+        &mut self,
+        key: &str,
+        question: &str,
+        default: &str,
+        read: impl Fn(&str) -> Result<T, String>,
+    ) -> Answer<T> {
+        loop {
+            let text = self.text(key, question, default)?;
+            match (read(&text), &self) {
+                (Ok(value), _) => return Ok(value),
+                (Err(what), Self::File { .. }) => {
+                    return refused(format!("{}{key} = {text:?}: {what}", self.place()));
+                }
+                (Err(what), Self::Terminal) => println!("{text:?}: {what}"),
+            }
+        }
+    }
+
+    /// Asks which serial ports to take, none by default; `choices` are those that were found.
+    pub fn ports(&mut self, key: &str, question: &str, choices: &[PathBuf]) -> Answer<Vec<PathBuf>> {
+        let wrong = |paths: &[PathBuf]| {
+            paths.iter().find_map(|path| Some(format!("{}: {}", path.display(), no_serial_port(path)?)))
+        };
         if let Self::File { .. } = self {
             let strings = |value: &Value| {
                 let values = value.as_array()?.iter();
                 values.map(|value| value.as_str().map(PathBuf::from)).collect::<Option<Vec<_>>>()
             };
             let paths = self.given(key, "a list of strings", strings)?.unwrap_or_default();
-            return match missing(&paths) {
-                Some(path) => refused(format!(
-                    "{}{key}: {}: there is no such file; allowed: paths of serial ports, such as /dev/ttyUSB0",
-                    self.place(),
-                    path.display()
+            return match wrong(&paths) {
+                Some(what) => refused(format!(
+                    "{}{key}: {what}; allowed: paths of serial ports, such as /dev/ttyUSB0",
+                    self.place()
                 )),
                 None => Ok(paths),
             };
@@ -191,10 +216,8 @@ impl Questions {
                 "all" => choices.to_vec(),
                 paths => paths.split_whitespace().map(PathBuf::from).collect(),
             };
-            match missing(&paths) {
-                Some(path) => {
-                    prompt = format!("{}: there is no such file; allowed: {allowed}\n", path.display())
-                }
+            match wrong(&paths) {
+                Some(what) => prompt = format!("{what}; allowed: {allowed}\n"),
                 None => return Ok(paths),
             }
         }
@@ -232,6 +255,16 @@ impl Questions {
             Self::Terminal => String::new(),
         }
     }
+}
+
+/// Why a path cannot be a serial port's; tells it without opening what may be there.
+fn no_serial_port(path: &Path) -> Option<&'static str> {
+    let Ok(metadata) = path.metadata() else { return Some("there is no such file") };
+    let (major, minor) = (stat::major(metadata.rdev()), stat::minor(metadata.rdev()));
+    // Pseudo-terminals are not listed there.
+    let subsystem = fs::read_link(format!("/sys/dev/char/{major}:{minor}/subsystem"));
+    let is_other = subsystem.is_ok_and(|subsystem| !subsystem.ends_with("tty"));
+    (!metadata.file_type().is_char_device() || is_other).then_some("this is no serial port")
 }
 
 /// One line of the person at the terminal; nothing stands for the default.
@@ -278,6 +311,7 @@ mod tests {
         assert_eq!(choose("", Some("sim")).unwrap(), "sim");
         for (wrong, part) in [
             ("vsync = 'pps:'", "answers.toml: vsync = \"pps:\"; allowed: sim, pps:SOURCE"),
+            ("vsync = 'ppsource'", "allowed: sim, pps:SOURCE"),
             ("vsync = 1", "allowed: a string"),
             ("", "vsync is missing: What watches?; allowed: sim, pps:SOURCE"),
         ] {
@@ -291,6 +325,14 @@ mod tests {
         let whole = |text: &str| questions(text).whole("rows", "Rows?", 720, 1..=8192);
         assert_eq!(whole("rows = 360.0").unwrap(), 360);
         assert!(message(whole("rows = 1.5")).contains("allowed: whole numbers, 1 to 8192"));
+        let drm = |text: &str| {
+            let mut questions = questions(&format!("projector = '{text}'"));
+            questions.choose("projector", "What drives it?", &[], &["drm:CARD:CONNECTOR"], None)
+        };
+        assert_eq!(drm("drm:/dev/dri/card0:HDMI-A-1").unwrap(), "drm:/dev/dri/card0:HDMI-A-1");
+        for wrong in ["drm", "drm:", "drm::", "drm::HDMI-A-1", "drm:/dev/dri/card0:"] {
+            assert!(message(drm(wrong)).contains("allowed: drm:CARD:CONNECTOR"), "{wrong}");
+        }
         assert!(message(questions("colour = 'red'").finish()).contains("colour: not asked for"));
     }
 }
