@@ -64,17 +64,23 @@ impl ChosenCamera {
         choices.push(AnswerChoice::new(SIM, "simulated, to rehearse"));
         let default = choices[0].value.clone();
         let forms = ["genicam:NAME or ADDRESS", "v4l2:NODE"];
-        let chosen = questions.choose("camera", "Which camera?", &choices, &forms, Some(&default))?;
-        let known = connected.cameras.iter().find(|eye| eye.is(&chosen));
-        let chosen = known.map_or(chosen, |eye| eye.value.clone());
-        let known = known.and_then(|eye| eye.facts.clone());
-        match chosen.split_once(':') {
-            Some((GENICAM, named)) => {
-                let facts = known.map_or_else(|| offered_by_genicam(named), Ok)?;
-                Self::genicam(questions, named, &facts, most_rows)
-            }
-            Some((V4L2, device)) => Self::v4l2(questions, device, &known.unwrap_or_default(), most_rows),
-            _ => Ok(Self::Sim),
+        loop {
+            let chosen = questions.choose("camera", "Which camera?", &choices, &forms, Some(&default))?;
+            let known = connected.cameras.iter().find(|eye| eye.is(&chosen));
+            let chosen = known.map_or(chosen, |eye| eye.value.clone());
+            let known = known.and_then(|eye| eye.facts.clone());
+            return match chosen.split_once(':') {
+                Some((GENICAM, named)) => match known.map_or_else(|| offered_by_genicam(named), Ok) {
+                    Ok(facts) => Self::genicam(questions, named, &facts, most_rows),
+                    Err(error) if matches!(questions, Questions::Terminal) => {
+                        println!("{error}");
+                        continue;
+                    }
+                    Err(error) => Err(error),
+                },
+                Some((V4L2, device)) => Self::v4l2(questions, device, &known.unwrap_or_default(), most_rows),
+                _ => Ok(Self::Sim),
+            };
         }
     }
 

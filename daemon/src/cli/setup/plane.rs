@@ -28,17 +28,20 @@ pub(super) fn ask(questions: &mut Questions, connected: &ConnectedDevices) -> Re
     let vsync = ask_vsync(questions, connected, &camera)?;
     let period_us = 1e6 / rate_hz;
     let row_time_us = period_us / (f64::from(rows) * LINES_PER_ROW);
+    // All rows are drawn before the next edge.
+    let longest_us = floored(rounded(period_us) / f64::from(rows)).min(10_000.0);
     let row_time_us = questions.number(
         "row_time_us",
         "Microseconds from one row of the projector to the next (`raysweep calibrate` measures it)",
         rounded(row_time_us),
-        0.1..=10_000.0,
+        0.1..=longest_us,
     )?;
+    let latest_us = floored(rounded(period_us) - f64::from(rows) * row_time_us).max(0.0);
     let first_row_us = questions.number(
         "first_row_us",
         "Microseconds from the VSYNC edge to the first row (`raysweep calibrate` measures it)",
-        rounded(LINES_BEFORE * row_time_us).min(period_us),
-        0.0..=rounded(period_us),
+        rounded(LINES_BEFORE * row_time_us).min(latest_us),
+        0.0..=latest_us,
     )?;
     let text = camera.write(RigText::new("plane"));
     let text = write_vsync(text.table("vsync"), &vsync, period_us, questions)?;
@@ -208,6 +211,11 @@ fn write_projector(text: RigText, projector: &str) -> RigText {
         None if projector == "external" => text.key("driver", "external"),
         None => text.key("driver", SIM),
     }
+}
+
+/// To a thousandth of a microsecond, and no more.
+fn floored(us: f64) -> f64 {
+    (us * 1e3).floor() / 1e3
 }
 
 /// To a thousandth of a microsecond.
