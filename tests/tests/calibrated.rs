@@ -291,7 +291,6 @@ fn pixels_that_the_board_did_not_light_have_no_light_and_harm_no_others() {
 fn a_strip_of_the_board_shows_how_late_each_image_is() {
     let studio = Studio::new();
     let (calibration, geometry) = (studio.calibration(0.0), studio.calibrated(0.0));
-    let noise = calibration.noise;
     let gauge_of = |columns: Range<usize>| {
         let strip = BoardStrip { columns, jitter_us: 5.0 };
         let centre_us = geometry.raster.row_centre_us(geometry.first_row);
