@@ -159,6 +159,10 @@ fn wrong_answers_write_nothing_and_name_what_is_allowed() {
         ),
         ("camera = 'sim'\nprojector = 'sim'\nvsync = 'sim'\nfirst_row_us = 900", "allowed: 0 to 666.827"),
         ("camera = 'sim'\nprojector = 'sim'\nvsync = 'sim'\nprojector_rows = 1.5", "whole numbers"),
+        (
+            "projector_rows = 0\nprojector_hz = 'slow'\ncamera = 'sim'\nvsync = 'wire'",
+            "answers.toml: projector_rows = 0; allowed: 1 to 8192\nanswers.toml: projector_hz = \"slow\"; allowed: a number\nanswers.toml: vsync",
+        ),
         ("camera = ", "answers.toml"),
         ("camera = 'sim'\nask_ports = ['132']", "ask_ports: 132: there is no such file"),
         ("camera = 'sim'\nask_ports = ['answers.toml']", "ask_ports: answers.toml: this is no serial port"),

@@ -353,8 +353,10 @@ mod tests {
         let facts = CameraFacts { formats, ..CameraFacts::default() };
         let size = |format, most_rows, answers: &str| {
             let answers = answers.parse().unwrap();
-            let mut questions = Questions::File { path: "answers.toml".into(), answers };
-            ask_size(&mut questions, &facts, format, most_rows)
+            let mut questions =
+                Questions::File { path: "answers.toml".into(), answers, mistakes: Vec::new() };
+            let size = ask_size(&mut questions, &facts, format, most_rows)?;
+            questions.finish().map(|()| size)
         };
         assert_eq!(size(mono8, 720, "").unwrap(), (480, 640));
         assert_eq!(size(mono10, 720, "").unwrap(), (720, 1280));

@@ -28,8 +28,8 @@ impl AnswerChoice {
 
 /// Asks a person, or a file.
 pub(super) enum Questions {
-    /// The answers of a file that are not asked for yet.
-    File { path: PathBuf, answers: Table },
+    /// The answers of a file that are not asked for yet, and what is wrong with others.
+    File { path: PathBuf, answers: Table, mistakes: Vec<String> },
     /// A person.
     Terminal,
 }
@@ -56,7 +56,7 @@ impl Questions {
             .map_err(|source| CommandFailure::File { path: path.to_owned(), source })?;
         let parsed: Result<Table, _> = text.parse();
         match parsed {
-            Ok(answers) => Ok(Self::File { path: path.to_owned(), answers }),
+            Ok(answers) => Ok(Self::File { path: path.to_owned(), answers, mistakes: Vec::new() }),
             Err(error) => refused(format!("{}: {error}", path.display())),
         }
     }
@@ -83,11 +83,12 @@ impl Questions {
         let values = choices.iter().map(|choice| choice.value.as_str()).chain(forms.iter().copied());
         let allowed = format!("allowed: {}", values.collect::<Vec<_>>().join(", "));
         if let Self::File { .. } = self {
-            let given = self.given(key, "a string", |value| value.as_str().map(str::to_owned))?;
+            let given = self.given(key, "a string", |value| value.as_str().map(str::to_owned));
+            // What is asked next depends on it.
             return match given.or_else(|| default.map(str::to_owned)) {
                 Some(value) if fits(&value) => Ok(value),
-                Some(value) => refused(format!("{}{key} = {value:?}; {allowed}", self.place())),
-                None => refused(format!("{}{key} is missing: {question}; {allowed}", self.place())),
+                Some(value) => Err(self.ended_by(&format!("{key} = {value:?}; {allowed}"))),
+                None => Err(self.ended_by(&format!("{key} is missing: {question}; {allowed}"))),
             };
         }
         let mut prompt = format!("{question}\n");
@@ -119,11 +120,12 @@ impl Questions {
         let range = format!("allowed: {} to {}", allowed.start(), allowed.end());
         if let Self::File { .. } = self {
             let number = |value: &Value| value.as_float().or(value.as_integer().map(|whole| whole as f64));
-            let value = self.given(key, "a number", number)?.unwrap_or(default);
-            return match allowed.contains(&value) {
-                true => Ok(value),
-                false => refused(format!("{}{key} = {value}; {range}", self.place())),
-            };
+            let value = self.given(key, "a number", number).unwrap_or(default);
+            if !allowed.contains(&value) {
+                self.note(&format!("{key} = {value}; {range}"));
+                return Ok(default);
+            }
+            return Ok(value);
         }
         let mut prompt = format!("{question}, {range}\n");
         loop {
@@ -149,7 +151,10 @@ impl Questions {
             let value = self.number(key, question, f64::from(default), f64::from(first)..=f64::from(last))?;
             match self {
                 _ if value.fract() == 0.0 => return Ok(value as u32),
-                Self::File { .. } => return refused(format!("{}{key} = {value}; {allowed}", self.place())),
+                Self::File { .. } => {
+                    self.note(&format!("{key} = {value}; {allowed}"));
+                    return Ok(default);
+                }
                 Self::Terminal => println!("{value} is no whole number; {allowed}"),
             }
         }
@@ -158,7 +163,7 @@ impl Questions {
     /// Asks for a text, which may be empty if the default is.
     pub fn text(&mut self, key: &str, question: &str, default: &str) -> Answer<String> {
         if let Self::File { .. } = self {
-            let given = self.given(key, "a string", |value| value.as_str().map(str::to_owned))?;
+            let given = self.given(key, "a string", |value| value.as_str().map(str::to_owned));
             return Ok(given.unwrap_or_else(|| default.into()));
         }
         asked(&format!("{question}\n"), Some(default))
@@ -176,10 +181,13 @@ impl Questions {
             let text = self.text(key, question, default)?;
             match (read(&text), &self) {
                 (Ok(value), _) => return Ok(value),
-                (Err(what), Self::File { .. }) => {
-                    return refused(format!("{}{key} = {text:?}: {what}", self.place()));
-                }
                 (Err(what), Self::Terminal) => println!("{text:?}: {what}"),
+                (Err(what), Self::File { .. }) => {
+                    let what = format!("{key} = {text:?}: {what}");
+                    let Ok(instead) = read(default) else { return Err(self.ended_by(&what)) };
+                    self.note(&what);
+                    return Ok(instead);
+                }
             }
         }
     }
@@ -194,14 +202,12 @@ impl Questions {
                 let values = value.as_array()?.iter();
                 values.map(|value| value.as_str().map(PathBuf::from)).collect::<Option<Vec<_>>>()
             };
-            let paths = self.given(key, "a list of strings", strings)?.unwrap_or_default();
-            return match wrong(&paths) {
-                Some(what) => refused(format!(
-                    "{}{key}: {what}; allowed: paths of serial ports, such as /dev/ttyUSB0",
-                    self.place()
-                )),
-                None => Ok(paths),
-            };
+            let paths = self.given(key, "a list of strings", strings).unwrap_or_default();
+            if let Some(what) = wrong(&paths) {
+                self.note(&format!("{key}: {what}; allowed: paths of serial ports, such as /dev/ttyUSB0"));
+                return Ok(Vec::new());
+            }
+            return Ok(paths);
         }
         if choices.is_empty() {
             return Ok(Vec::new());
@@ -226,9 +232,10 @@ impl Questions {
     /// Ends the questions.
     ///
     /// # Errors
-    /// For answers of a file to questions that were not asked.
+    /// For all answers of a file that were wrong, or, if none was, for those to questions that were not asked.
     pub fn finish(self) -> Answer<()> {
         match &self {
+            Self::File { mistakes, .. } if !mistakes.is_empty() => refused(mistakes.join("\n")),
             Self::File { answers, .. } if !answers.is_empty() => {
                 let keys: Vec<&str> = answers.keys().map(String::as_str).collect();
                 let keys = keys.join(", ");
@@ -239,14 +246,29 @@ impl Questions {
     }
 
     /// The answer of a file to `key`, if it has one.
-    fn given<T>(&mut self, key: &str, wanted: &str, read: impl Fn(&Value) -> Option<T>) -> Answer<Option<T>> {
-        let place = self.place();
-        let Self::File { answers, .. } = self else { return Ok(None) };
-        let Some(value) = answers.remove(key) else { return Ok(None) };
-        match read(&value) {
-            Some(given) => Ok(Some(given)),
-            None => refused(format!("{place}{key} = {value}; allowed: {wanted}")),
+    fn given<T>(&mut self, key: &str, wanted: &str, read: impl Fn(&Value) -> Option<T>) -> Option<T> {
+        let Self::File { answers, .. } = self else { return None };
+        let value = answers.remove(key)?;
+        let given = read(&value);
+        if given.is_none() {
+            self.note(&format!("{key} = {value}; allowed: {wanted}"));
         }
+        given
+    }
+
+    /// Notes what is wrong with an answer of a file, so that all mistakes are told at once.
+    fn note(&mut self, what: &str) {
+        let what = format!("{}{what}", self.place());
+        if let Self::File { mistakes, .. } = self {
+            mistakes.push(what);
+        }
+    }
+
+    /// The mistakes of a file, up to one without whose answer the questions cannot go on.
+    fn ended_by(&mut self, what: &str) -> CommandFailure {
+        self.note(what);
+        let Self::File { mistakes, .. } = self else { return CommandFailure::Setup(what.into()) };
+        CommandFailure::Setup(mistakes.join("\n"))
     }
 
     fn place(&self) -> String {
@@ -293,7 +315,8 @@ mod tests {
     use super::*;
 
     fn questions(answers: &str) -> Questions {
-        Questions::File { path: "answers.toml".into(), answers: answers.parse().unwrap() }
+        let (answers, mistakes) = (answers.parse().unwrap(), Vec::new());
+        Questions::File { path: "answers.toml".into(), answers, mistakes }
     }
 
     fn message<T: std::fmt::Debug>(answer: Answer<T>) -> String {
@@ -318,11 +341,19 @@ mod tests {
             let found = message(choose(wrong, None));
             assert!(found.contains(part), "{found}");
         }
-        let number = |text: &str| questions(text).number("rows", "Rows?", 720.0, 1.0..=8192.0);
+        let number = |text: &str| {
+            let mut questions = questions(text);
+            let number = questions.number("rows", "Rows?", 720.0, 1.0..=8192.0)?;
+            questions.finish().map(|()| number)
+        };
         assert_eq!((number("rows = 360").unwrap(), number("").unwrap()), (360.0, 720.0));
         assert!(message(number("rows = nan")).contains("allowed: 1 to 8192"));
         assert!(message(number("rows = 'many'")).contains("a number"));
-        let whole = |text: &str| questions(text).whole("rows", "Rows?", 720, 1..=8192);
+        let whole = |text: &str| {
+            let mut questions = questions(text);
+            let whole = questions.whole("rows", "Rows?", 720, 1..=8192)?;
+            questions.finish().map(|()| whole)
+        };
         assert_eq!(whole("rows = 360.0").unwrap(), 360);
         assert!(message(whole("rows = 1.5")).contains("allowed: whole numbers, 1 to 8192"));
         let drm = |text: &str| {
