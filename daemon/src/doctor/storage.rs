@@ -61,7 +61,8 @@ fn writable(folder: &Path) -> String {
     let own = format!("give by --data a folder that {} may write", super::host::user());
     let owner = folder.metadata().ok().filter(fs::Metadata::is_dir);
     let owner = owner.and_then(|metadata| User::from_uid(Uid::from_raw(metadata.uid())).ok().flatten());
-    match owner.filter(|owner| owner.uid != Uid::effective()) {
+    // The daemon's folder is never root's.
+    match owner.filter(|owner| owner.uid != Uid::effective() && !owner.uid.is_root()) {
         Some(User { name, .. }) => {
             format!("{own}, or ask as its owner: `runuser -u {name} -- raysweep doctor` as root")
         }
