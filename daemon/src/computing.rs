@@ -47,7 +47,10 @@ impl Computing {
         compute: impl FnOnce() -> Result<T, RpcError> + Send,
     ) -> Result<T, RpcError> {
         // The state when its turn has come, not when it was asked for.
-        self.now(|| if is_free(state()) { compute() } else { Err(busy()) })
+        self.now(|| match is_free(state()) {
+            true => compute(),
+            false => Err(busy("a run is in progress, and this would take the processor from it")),
+        })
     }
 
     /// Checks a plan. During a run, only a plan that was checked before is answered, with the report of then.
@@ -63,7 +66,9 @@ impl Computing {
         if !is_free(state()) {
             let kept = self.kept();
             let found = kept.iter().find(|(of, _)| of == plan).map(|(_, report)| report.clone());
-            let mut report = found.ok_or_else(busy)?;
+            let mut report = found.ok_or_else(|| {
+                busy("a run is in progress, and only plans that were checked before it can be checked")
+            })?;
             report.warnings.push(
                 "this report was made before the run in progress: free memory and disk space are those of then".into(),
             );
@@ -94,9 +99,8 @@ fn is_free(state: RunState) -> bool {
     matches!(state, RunState::Idle | RunState::Faulted)
 }
 
-fn busy() -> RpcError {
-    let what = "a run is in progress, and only plans that were checked before it can be checked: try again after its end";
-    RpcError::new(ErrorCode::Busy, what)
+fn busy(why: &str) -> RpcError {
+    RpcError::new(ErrorCode::Busy, format!("{why}: try again after its end"))
 }
 
 #[cfg(test)]

@@ -28,7 +28,7 @@ use crate::live::{LiveFile, Outlet};
 use crate::mirror;
 use crate::probes::Probes;
 use crate::procedure::lab::Lab;
-use crate::procedure::{Unresumable, foresee, foresee_rest};
+use crate::procedure::{foresee, foresee_rest};
 use crate::rig::{AnyRig, RigError, SharedRig};
 use crate::run::board::{StatusBoard, WrongState};
 use crate::run::life::{Foreseen, Run, conduct};
@@ -423,12 +423,9 @@ impl Runner {
         }
         let foreseen =
             foresee_rest(&self.lab(), &plan, session.dir(), &ledger.state().session).map_err(|error| {
-                match error {
-                    Unresumable::Past(what) => no_session(format!("{}: {what}", session.dir().display())),
-                    Unresumable::Plan(error) => RpcError {
-                        message: error.render(&session.plan_path().display().to_string(), &plan),
-                        ..invalid_plan(&error)
-                    },
+                RpcError {
+                    message: error.render(&session.plan_path().display().to_string(), &plan),
+                    ..invalid_plan(&error)
                 }
             })?;
         let begun = ledger.state().session.shape;

@@ -104,7 +104,8 @@ fn frames_whose_stamps_mean_something_else_have_no_edge() {
     assert_wrong(&report, &[("frames and edges", Grade::Failure)]);
     let ties = check(&report, "frames and edges");
     assert!(ties.found.contains("0 of"), "{ties:?}");
-    assert!(ties.remedy.as_ref().unwrap().contains("timestamp_at"), "{ties:?}");
+    let remedy = ties.remedy.as_ref().unwrap();
+    assert!(remedy.contains("timestamp_at = \"exposure_start\"") && !remedy.contains("latency"), "{remedy}");
 }
 
 #[test]
@@ -191,6 +192,19 @@ fn a_plan_is_examined_without_a_daemon_if_the_devices_open() {
     assert!(!found.contains("the plan needs") && said.contains("plan.toml: not examined"), "{found}: {said}");
 }
 
+#[test]
+fn an_examination_that_was_cancelled_is_not_passed() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("rig.toml");
+    let sound = WITHOUT_WATCHER.replace("modemline\"\nmodemline.port = \"/dev/serial/by-id/none\"", "sim\"");
+    fs::write(&path, sound).unwrap();
+    let rig = AnyRig::load(&path).unwrap();
+    let report = doctor::examine(&rig.into(), &folder.path().join("data"), None, &|| false);
+    assert_eq!(report.worst(), Grade::Failure, "{report:#?}");
+    assert!(check(&report, "examination").found.contains("cancelled"), "{report:#?}");
+    assert!(!folder.path().join("data").exists(), "doctor only looks");
+}
+
 /// What is found on a simulated rig without a wire.
 fn simulated(text: &str) -> DoctorReport {
     let folder = tempfile::tempdir().unwrap();
@@ -218,6 +232,7 @@ fn faults_of_line_and_camera_are_named() {
     assert_wrong(&crosstalk, &[("vsync edges", Warning), ("frames and edges", Warning)]);
     assert_wrong(&simulated_with("", "[sim.vsync]\nunseen = 0.1\n"), &[("vsync edges", Warning)]);
     assert_wrong(&simulated_with("", "[sim.camera]\ndropped = 0.2\n"), &[("frames", Warning)]);
+    assert_wrong(&simulated_with("", "[sim.camera]\ndropped = 0.8\n"), &[("frames", Failure)]);
     // A projector at 50 Hz.
     let other = simulated_with("period_us = 20000", "");
     assert_wrong(&other, &[]);

@@ -156,11 +156,25 @@ fn wrong_answers_write_nothing_and_name_what_is_allowed() {
         ("camera = 'sim'\nvsync = 'wire'\nprojector = 'sim'", "vsync = \"wire\"; allowed: "),
         ("camera = 'sim'\nprojector = 'sim'\nvsync = 'sim'\nprojector_rows = 0", "allowed: 1 to 8192"),
         ("camera = 'sim'\nprojector = 'sim'\nvsync = 'sim'\nmirror = 'sim'", "mirror: not asked for"),
-        ("camera = 'sim'\nprojector = 'sim'\nvsync = 'sim'\nrow_time_us = 900", "do not go together"),
+        (
+            "camera = 'sim'\nprojector = 'sim'\nvsync = 'sim'\nrow_time_us = 900",
+            "row_time_us = 900; allowed: 0.1 to 23.148",
+        ),
+        ("camera = 'sim'\nprojector = 'sim'\nvsync = 'sim'\nfirst_row_us = 900", "allowed: 0 to 666.827"),
         ("camera = 'sim'\nprojector = 'sim'\nvsync = 'sim'\nprojector_rows = 1.5", "whole numbers"),
+        (
+            "projector_rows = 0\nprojector_hz = 'slow'\ncamera = 'sim'\nvsync = 'wire'",
+            "answers.toml: projector_rows = 0; allowed: 1 to 8192\nanswers.toml: projector_hz = \"slow\"; allowed: a number\nanswers.toml: vsync",
+        ),
         ("camera = ", "answers.toml"),
         ("camera = 'sim'\nask_ports = ['132']", "ask_ports: 132: there is no such file"),
-        ("kind = 'dots'\ncamera = 'sim'\nmirror = 'optotune:/dev/null'", "laser_port is missing"),
+        ("camera = 'sim'\nask_ports = ['answers.toml']", "ask_ports: answers.toml: this is no serial port"),
+        (
+            "camera = 'v4l2:/none'\ncontrols = 'gain'",
+            "controls = \"gain\": \"gain\" is not NAME=WHOLE NUMBER",
+        ),
+        ("camera = 'v4l2:/none'\npixel_format = 'Mono13'", "pixel_format = \"Mono13\": "),
+        ("kind = 'dots'\ncamera = 'sim'\nmirror = 'optotune:/dev/null'", "laser_port = \"\": an Optotune"),
     ] {
         let output = setup(folder.path(), answers);
         let error: Value = serde_json::from_slice(&output.stdout).unwrap();
@@ -180,24 +194,43 @@ fn wrong_answers_write_nothing_and_name_what_is_allowed() {
 }
 
 #[test]
-fn a_person_who_takes_every_default_gets_a_rig_that_can_be_rehearsed() {
+fn a_kernels_camera_with_a_trigger_can_run_freely_for_a_viewfinder() {
     let folder = tempfile::tempdir().unwrap();
+    let answers = "camera = 'v4l2:/none'\ncontrols = 'trigger_mode=1, gain=0'\nprojector = 'external'\nvsync = 'pps:/dev/pps0'\n";
+    let text = |answers: &str| {
+        written(&forced(folder.path(), answers));
+        fs::read_to_string(folder.path().join("new-rig.toml")).unwrap()
+    };
+    assert!(text(answers).contains("free_running = [[\"trigger_mode\", 0]]"), "{}", text(answers));
+    let own = format!("{answers}free_running = 'trigger_mode=2'\n");
+    assert!(text(&own).contains("free_running = [[\"trigger_mode\", 2]]"), "{}", text(&own));
+}
+
+/// Runs `setup` at a terminal at which a person writes these lines; returns what it says.
+fn at_a_terminal(folder: &Path, lines: &str) -> String {
     let pty = openpty(None, None).unwrap();
     let slave = |end: &OwnedFd| Stdio::from(end.try_clone().unwrap());
     let mut command = Command::new(env!("CARGO_BIN_EXE_raysweep"));
-    command.args(["setup", "--rig", "new-rig.toml"]).current_dir(folder.path());
+    command.args(["setup", "--rig", "new-rig.toml"]).current_dir(folder);
     let mut process =
         Process::start(command.stdin(slave(&pty.slave)).stdout(slave(&pty.slave)).stderr(slave(&pty.slave)));
     // The terminal ends when the process has ended and nobody here holds its end.
     drop((command, pty.slave));
     let mut person = File::from(pty.master);
-    // No camera, and nothing else, but the simulated one, wherever this machine has none.
-    person.write_all(b"\n\n\n\nsim\nsim\nsim\n\n\n\n\n").unwrap();
+    person.write_all(lines.as_bytes()).unwrap();
     let mut said = Vec::new();
     // It ends in an error.
     let _ = person.read_to_end(&mut said);
-    let said = String::from_utf8_lossy(&said);
+    let said = String::from_utf8_lossy(&said).into_owned();
     assert!(process.wait().success(), "{said}");
+    said
+}
+
+#[test]
+fn a_person_who_takes_every_default_gets_a_rig_that_can_be_rehearsed() {
+    let folder = tempfile::tempdir().unwrap();
+    // No camera, and nothing else, but the simulated one, wherever this machine has none.
+    let said = at_a_terminal(folder.path(), "\n\n\n\nsim\nsim\nsim\n\n\n\n\n");
     assert!(said.contains("connected:") && said.contains("next: `raysweep doctor"), "{said}");
     assert!(failures(&examined(folder.path())).is_empty());
 }
@@ -232,5 +265,20 @@ fn only_two_regular_files_are_written_both_or_neither() {
     for endless in ["pipe", "/dev/zero"] {
         let said = refused("rig.toml", "plan.toml", endless);
         assert!(said.contains(&format!("cannot read {endless}: it is not a regular file")), "{said}");
+    }
+}
+
+#[test]
+fn a_slip_costs_a_person_one_answer() {
+    let folder = tempfile::tempdir().unwrap();
+    // The first line answers a question about serial ports on a machine that has some, and no other question.
+    let lines = "none\nplane\n\n\nv4l2:/none\nMono13\nMono10\n\n\ngain\ntrigger_mode=1\n\n\nexternal\npps:\npps:/dev/pps0\n\n\n";
+    let said = at_a_terminal(folder.path(), lines);
+    for slip in ["\"Mono13\": ", "\"gain\": \"gain\" is not NAME=WHOLE NUMBER", "\"pps:\" is none of them"] {
+        assert!(said.contains(slip), "{slip}: {said}");
+    }
+    let text = fs::read_to_string(folder.path().join("new-rig.toml")).unwrap();
+    for key in ["pixel_format = \"Mono10\"", "controls = [[\"trigger_mode\", 1]]", "source = \"/dev/pps0\""] {
+        assert!(text.contains(key), "{key}: {text}");
     }
 }

@@ -263,7 +263,7 @@ fn only_the_page_itself_is_let_in_and_only_with_its_users_rights() {
         let names: Value = serde_json::from_slice(&names).unwrap();
         assert_eq!((status, names["epipolar"].is_u64()), (200, true), "{names}");
         assert_eq!(page.get("live/epipolar").0, 200, "observers see live what a run does");
-        let why = format!("only members of the group `root` may read {}", data.display());
+        let why = format!("only root may read {}", data.display());
         for route in &of_session {
             let (status, _, body) = page.get(route);
             let text = String::from_utf8_lossy(&body).into_owned();

@@ -145,6 +145,7 @@ impl Case {
             trigger_period_us: 1e6 / f64::from(self.rate_hz),
             trigger_margin_us: 100.0,
             reopen: Duration::from_secs(5),
+            free_hz: None,
         };
         let mut camera = AravisCamera::open(&config, facts)?;
         let settings =

@@ -68,14 +68,8 @@ pub struct FoundDisplay {
 
 /// The serial ports of this host, by their permanent names where they have one.
 pub fn serial_ports() -> Vec<FoundPort> {
-    let permanent: Vec<(PathBuf, PathBuf)> = entries(Path::new("/dev/serial/by-id"))
-        .into_iter()
-        .filter_map(|link| Some((link.canonicalize().ok()?, link)))
-        .collect();
     let ports = serialport::available_ports().unwrap_or_default();
     let named = ports.into_iter().map(|port| {
-        let node = PathBuf::from(&port.port_name);
-        let link = permanent.iter().find(|(of, _)| *of == node).map(|(_, link)| link.clone());
         let about = match port.port_type {
             SerialPortType::UsbPort(usb) => {
                 let words = [usb.manufacturer, usb.product, usb.serial_number];
@@ -86,7 +80,8 @@ pub fn serial_ports() -> Vec<FoundPort> {
             SerialPortType::BluetoothPort => "Bluetooth".into(),
             SerialPortType::Unknown => "a serial port".into(),
         };
-        FoundPort { path: link.unwrap_or(node), about: about.trim_end().to_owned() }
+        let path = permanent(Path::new("/dev/serial/by-id"), port.port_name.into());
+        FoundPort { path, about: about.trim_end().to_owned() }
     });
     named.collect()
 }
@@ -142,10 +137,34 @@ pub fn displays() -> Vec<FoundDisplay> {
     found.collect()
 }
 
+/// The link in this folder that stays with a node's device, or the node itself if there is none.
+pub(crate) fn permanent(links: &Path, node: PathBuf) -> PathBuf {
+    let is_its = |link: &PathBuf| link.canonicalize().is_ok_and(|of| of == node);
+    entries(links).into_iter().find(is_its).unwrap_or(node)
+}
+
 /// The entries of a folder in order; none if it is missing.
 fn entries(folder: &Path) -> Vec<PathBuf> {
     let entries = fs::read_dir(folder).into_iter().flatten().flatten();
     let mut paths: Vec<PathBuf> = entries.map(|entry| entry.path()).collect();
     paths.sort();
     paths
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_node_is_called_by_the_link_that_stays_with_its_device_if_it_has_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let folder = folder.path().canonicalize().unwrap();
+        let [links, node] = ["by-id", "video2"].map(|name| folder.join(name));
+        fs::create_dir(&links).unwrap();
+        fs::write(&node, "").unwrap();
+        assert_eq!(permanent(&links, node.clone()), node);
+        std::os::unix::fs::symlink("../video2", links.join("usb-Eye-video-index0")).unwrap();
+        assert_eq!(permanent(&links, node), links.join("usb-Eye-video-index0"));
+        assert_eq!(permanent(&links, "/dev/null".into()), Path::new("/dev/null"));
+    }
 }

@@ -115,6 +115,7 @@ fn stream() {
         trigger_period_us: 16_666.667,
         trigger_margin_us: 500.0,
         reopen: Duration::from_secs(20),
+        free_hz: None,
     };
     let mut camera = AravisCamera::open(&config, facts).unwrap();
     let settings = CameraSettings { shutter: Shutter::Rolling, exposure_us: 10_000.0, trigger_delay_us: 0.0 };

@@ -26,6 +26,7 @@ const FACTS: RigFacts = RigFacts {
     trigger_period_us: 16_666.667,
     trigger_margin_us: 500.0,
     reopen: Duration::from_secs(20),
+    free_hz: None,
 };
 
 /// Runs freely with one frame per `period_us`, set by the camera's register.

@@ -19,6 +19,7 @@ const FACTS: RigFacts = RigFacts {
     trigger_period_us: 16_666.667,
     trigger_margin_us: 500.0,
     reopen: Duration::from_secs(20),
+    free_hz: None,
 };
 
 #[test]

@@ -27,7 +27,7 @@ pub struct PlaneDevices {
     pub subject: SubjectSwitch,
     /// The devices' clock.
     pub clock: Clock,
-    /// Ground truth of the line, for tests only; real rigs have none.
+    /// The line behind them, with its ground truth.
     pub truth: TruthProbe,
 }
 
@@ -39,7 +39,7 @@ impl PlaneDevices {
     }
 }
 
-/// Access to the ground truth behind the devices, for tests only.
+/// The line behind the devices; its ground truth is for tests only.
 #[derive(Clone)]
 pub struct TruthProbe(SharedLine);
 

@@ -98,6 +98,7 @@ impl Studio {
             covariance: CalibrationCovariance::independent([0.0; 5]),
             response: PixelResponse::with_beam(places, &beam).unwrap(),
             white_dn: Array2::from_shape_fn(size, |(t, s)| self.white_dn(t, s) as f32),
+            noise: NoiseModel { read_variance: 6e-5, gain: 2.4e-4 },
             strip: None,
             lamp: None,
         }
@@ -290,9 +291,8 @@ fn pixels_that_the_board_did_not_light_have_no_light_and_harm_no_others() {
 fn a_strip_of_the_board_shows_how_late_each_image_is() {
     let studio = Studio::new();
     let (calibration, geometry) = (studio.calibration(0.0), studio.calibrated(0.0));
-    let noise = NoiseModel { read_variance: 6e-5, gain: 2.4e-4 };
     let gauge_of = |columns: Range<usize>| {
-        let strip = BoardStrip { columns, noise, jitter_us: 5.0 };
+        let strip = BoardStrip { columns, jitter_us: 5.0 };
         let centre_us = geometry.raster.row_centre_us(geometry.first_row);
         JitterGauge::new(&calibration, &strip, geometry.raster.period_us, centre_us)
     };

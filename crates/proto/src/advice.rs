@@ -32,6 +32,8 @@ pub struct NoiseEstimate {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum NoiseSource {
+    /// The calibration in use has measured it.
+    Calibrated,
     /// The rig file states `camera.electrons_per_dn` and `camera.read_noise_e`.
     Stated,
     /// Values missing in the rig file are those of the simulation.

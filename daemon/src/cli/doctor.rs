@@ -85,6 +85,9 @@ pub fn text(report: &DoctorReport) -> String {
     }
     let count = |grade: Grade| report.checks.iter().filter(|check| check.grade == grade).count();
     lines.push(match (count(Grade::Failure), count(Grade::Warning)) {
+        (0, 0) if count(Grade::Skipped) > 0 => {
+            "nothing is wrong with what was examined; see what was skipped".into()
+        }
         (0, 0) => "nothing is wrong".into(),
         (failures, warnings) => format!("{}, {}", counted(failures, "failure"), counted(warnings, "warning")),
     });

@@ -1,14 +1,23 @@
 //! Reads plans and other short texts that users name.
 
+use std::fs::File;
+use std::io::{self, Read};
 use std::path::Path;
 
 use raysweep_session::input;
 
 use super::failure::CommandFailure;
 
-/// The text of a plan.
+/// The text of a plan, which may come through a pipe, as scripts make plans.
 pub(super) fn read_plan(path: &Path) -> Result<String, CommandFailure> {
-    read_small(path)
+    let read = || {
+        let file = File::open(path)?;
+        match file.metadata()?.is_file() {
+            true => input::read_text(path, MOST_BYTES),
+            false => io::read_to_string(file.take(MOST_BYTES)),
+        }
+    };
+    read().map_err(|source| CommandFailure::File { path: path.to_owned(), source })
 }
 
 /// Longest text that a user names: much more than the socket takes of a plan.

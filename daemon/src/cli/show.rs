@@ -217,6 +217,7 @@ pub(super) fn check(report: &CheckReport) -> String {
 fn advice(advice: &PlanAdvice) -> Vec<(&'static str, String)> {
     let PlanAdvice { noise, prior, expected, better } = advice;
     let source = match noise.source {
+        NoiseSource::Calibrated => "as the calibration measured it",
         NoiseSource::Stated => "as the rig file states it",
         NoiseSource::Simulated => "as simulated",
         NoiseSource::Assumed => {

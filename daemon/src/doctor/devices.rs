@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use raysweep_config::plan::SweepPlan;
+use raysweep_config::rig::aravis::TimestampAt;
 use raysweep_config::rig::dots::DotCameraDriver;
 use raysweep_config::rig::plane::{CameraDriver, ProjectorDriver};
 use raysweep_config::rig::vsync::VsyncDriver;
@@ -26,6 +27,11 @@ const DELAY_STEP_US: f64 = 2000.0;
 const DOT_RATE_HZ: f64 = 100.0;
 /// Share of frames that must have an edge.
 const MOST_FRAMES: f64 = 0.95;
+/// Share of frames without which no sweep ends: repeated attempts at a point take up to three times its frames, so that
+/// a third of them must be usable, and near that border a point succeeds only now and then.
+const LEAST_FRAMES: f64 = 0.5;
+/// Latencies that a rig file may state.
+const LATENCIES_US: std::ops::RangeInclusive<f64> = 0.0..=1e6;
 
 const CAMERA: &str = "camera";
 const VSYNC: &str = "vsync";
@@ -34,6 +40,8 @@ const EDGES: &str = "vsync edges";
 const FRAMES: &str = "frames";
 const TIES: &str = "frames and edges";
 const DELAY: &str = "trigger delay";
+/// What is needed to tell how frames and edges go together.
+const NEEDED: &[&str] = &[CAMERA, VSYNC, EDGES, FRAMES];
 
 /// Examines the devices of a plane rig.
 pub(super) fn examine_plane(checkup: &mut Checkup, rig: &Rig, go_on: &(dyn Fn() -> bool + Sync)) {
@@ -76,7 +84,8 @@ pub(super) fn examine_plane(checkup: &mut Checkup, rig: &Rig, go_on: &(dyn Fn() 
     }
     if let Some(capabilities) = &capabilities {
         examine_frames(checkup, rig, &frames, has_vsync && !seen.edges.is_empty());
-        examine_ties(checkup, capabilities, &seen, &frames);
+        examine_ties(checkup, rig, capabilities, &seen, &frames);
+        examine_delay(checkup, capabilities, &seen, &frames);
     }
 }
 
@@ -266,6 +275,7 @@ fn examine_frames(checkup: &mut Checkup, rig: &Rig, frames: &SeenFrames, has_edg
         };
         return checkup.failure(FRAMES, format!("{taken} frames, and then none for 2 s: no trigger"), remedy);
     }
+    let lost_frames: u64 = lost.iter().map(|(_, frames)| frames).sum();
     match lost.first() {
         Some((cause, _)) => {
             let found = format!("{taken} arrived, {}", text.join(", "));
@@ -276,7 +286,11 @@ fn examine_frames(checkup: &mut Checkup, rig: &Rig, frames: &SeenFrames, has_edg
                 LossCause::DriverFull => "the host is too busy: see real-time priority above",
                 _ => "check the cable and the bandwidth of the link",
             };
-            checkup.warning(FRAMES, found, remedy);
+            if (taken as f64) < LEAST_FRAMES * (taken as f64 + lost_frames as f64) {
+                checkup.failure(FRAMES, format!("{found}: too many for a sweep to end"), remedy);
+            } else {
+                checkup.warning(FRAMES, found, remedy);
+            }
         }
         None => checkup.ok(FRAMES, format!("{taken} arrived, none lost")),
     }
@@ -293,62 +307,125 @@ fn losses(series: &[FrameSeries]) -> Vec<(LossCause, u64)> {
     lost
 }
 
-/// Whether each frame has its edge, and whether the delay acts.
+/// Whether each frame has its edge.
 fn examine_ties(
+    checkup: &mut Checkup,
+    rig: &Rig,
+    camera: &CameraCapabilities,
+    line: &SeenLine,
+    SeenFrames { series, .. }: &SeenFrames,
+) {
+    let first = series.first().map(|first| (first, line.errors_us(first, camera.trigger_latency_us)));
+    let Some((first, errors_us)) = first.filter(|(_, errors_us)| !errors_us.is_empty()) else {
+        let remedy = "`raysweep doctor` again; if that does not help, the camera's time stamps do not follow this host's clock: the log says how they are made";
+        return checkup.unexamined(TIES, NEEDED, "no frame is dated after the first edge", remedy);
+    };
+    let max_jitter_us = SweepPlan::default().max_jitter_us;
+    // A frame that was taken before the first edge was seen proves nothing.
+    let judged = errors_us.len();
+    let tied = errors_us.iter().filter(|error_us| error_us.abs() <= max_jitter_us).count();
+    let off_us = median(errors_us).unwrap_or_default();
+    let found = format!(
+        "{tied} of {judged} frames begin within {max_jitter_us} us of where their edge puts them; the median is {off_us:+.1} us off"
+    );
+    if tied as f64 >= MOST_FRAMES * judged as f64 {
+        checkup.ok(TIES, found);
+    } else if off_us.abs() > max_jitter_us {
+        checkup.failure(TIES, found, remedy_of_offset(rig, camera, first.settings.exposure_us, off_us));
+    } else {
+        let remedy = format!(
+            "the camera's time stamps or the line's edges scatter: see vsync edges above, and use a camera whose stamps are made by its hardware (the log says so if frames are dated by their arrival); or raise a plan's max_jitter_us, {max_jitter_us} by default, and accept blurred delays"
+        );
+        if (tied as f64) < LEAST_FRAMES * judged as f64 {
+            checkup.failure(TIES, found, remedy);
+        } else {
+            checkup.warning(TIES, found, remedy);
+        }
+    }
+}
+
+/// What makes frames that begin `off_us` from where their edges put them begin there.
+fn remedy_of_offset(rig: &Rig, camera: &CameraCapabilities, exposure_us: f64, off_us: f64) -> String {
+    let section = &rig.file.camera;
+    let (table, key, stamps) = match section.driver {
+        CameraDriver::Aravis => (
+            "camera.aravis",
+            "camera.aravis.trigger_activation",
+            "camera.aravis.timestamp_at, the moment that its time stamps mean, ",
+        ),
+        CameraDriver::V4l2 => (
+            "camera.v4l2",
+            "the control that chooses the trigger's edge (camera.v4l2.controls)",
+            "camera.row_time_us, by which stamps of a frame's end are dated back, ",
+        ),
+        CameraDriver::Sim => ("sim.camera", "sim.camera", ""),
+    };
+    if section.driver == CameraDriver::Aravis
+        && (off_us.abs() - exposure_us).abs() <= SweepPlan::default().max_jitter_us
+    {
+        // A stamp of the other end of the exposure is off by the exposure.
+        let (now, other) = match section.aravis.timestamp_at {
+            TimestampAt::ExposureStart => ("exposure_start", "exposure_end"),
+            TimestampAt::ExposureEnd => ("exposure_end", "exposure_start"),
+        };
+        if (off_us > 0.0) == (section.aravis.timestamp_at == TimestampAt::ExposureStart) {
+            return format!(
+                "set camera.aravis.timestamp_at = \"{other}\" (now \"{now}\"): the frames are off by their exposure of {exposure_us} us"
+            );
+        }
+    }
+    let latency_us = camera.trigger_latency_us + off_us;
+    if LATENCIES_US.contains(&latency_us) {
+        format!(
+            "check {stamps}and {key}: which of the pulse's two edges triggers; if they and the camera's delay are right, set {table}.trigger_latency_us = {latency_us:.1} (now {})",
+            camera.trigger_latency_us
+        )
+    } else {
+        format!(
+            "no camera begins before its trigger: check {stamps}and {key}: which of the pulse's two edges triggers; then that {table}.trigger_latency_us = {} is not too long",
+            camera.trigger_latency_us
+        )
+    }
+}
+
+/// Whether the trigger's delay acts.
+fn examine_delay(
     checkup: &mut Checkup,
     camera: &CameraCapabilities,
     line: &SeenLine,
     SeenFrames { series, .. }: &SeenFrames,
 ) {
-    let errors: Vec<Vec<f64>> =
-        series.iter().map(|series| line.errors_us(series, camera.trigger_latency_us)).collect();
-    let Some((first, first_us)) = series.first().zip(errors.first().cloned().and_then(median)) else {
-        for name in [TIES, DELAY] {
-            checkup.skipped(name, "needs frames and edges");
-        }
-        return;
-    };
-    let max_jitter_us = SweepPlan::default().max_jitter_us;
-    // A frame that was taken before the first edge was seen proves nothing.
-    let judged = errors[0].len();
-    let tied = errors[0].iter().filter(|error_us| error_us.abs() <= max_jitter_us).count();
-    let found = format!(
-        "{tied} of {judged} frames begin within {max_jitter_us} us of where their edge puts them; the median is {first_us:+.1} us off"
-    );
-    if tied as f64 >= MOST_FRAMES * judged as f64 {
-        checkup.ok(TIES, found);
-    } else if first_us.abs() > max_jitter_us {
-        let latency_us = camera.trigger_latency_us + first_us;
-        let remedy = format!(
-            "if the camera's delay is right, set its trigger_latency_us = {latency_us:.1} in the rig file (now {}); check its trigger_activation, which decides between the pulse's two edges, and timestamp_at",
-            camera.trigger_latency_us
-        );
-        checkup.failure(TIES, found, remedy);
-    } else {
-        let remedy = "the camera's time stamps or the line's edges scatter: see vsync edges above, and use a camera whose stamps are made by its hardware";
-        checkup.warning(TIES, found, remedy);
-    }
-    let second = series.get(1).zip(errors.get(1).cloned().and_then(median));
-    match second {
-        None if series.len() == 1 && camera.trigger_delay_us == (0.0..=0.0) => checkup.failure(
+    if camera.trigger_delay_us == (0.0..=0.0) {
+        return checkup.failure(
             DELAY,
             "this camera cannot delay its trigger, so that delays cannot be swept",
             "name the maker's delay in the rig file (camera.v4l2.trigger_delay), or take a camera that has one",
-        ),
-        None => checkup.skipped(DELAY, "needs frames with two delays"),
-        Some((second, second_us)) => {
-            let told_us = second.settings.trigger_delay_us - first.settings.trigger_delay_us;
-            let moved_us = told_us + second_us - first_us;
-            let found = format!("exposures moved by {moved_us:.1} us when told to move by {told_us:.1} us");
-            if (moved_us - told_us).abs() <= max_jitter_us {
-                checkup.ok(DELAY, found);
-            } else {
-                checkup.failure(
-                    DELAY,
-                    found,
-                    "check by the maker's viewer that the trigger delay acts in the mode that the rig file sets; camera.aravis.features can set what it needs",
-                );
-            }
-        }
+        );
+    }
+    let measured = |series: &FrameSeries| {
+        let off_us = median(line.errors_us(series, camera.trigger_latency_us))?;
+        Some((series.settings.trigger_delay_us, off_us))
+    };
+    let measured: Vec<(f64, f64)> = series.iter().filter_map(measured).collect();
+    let &[(first_told_us, first_us), (told_us, second_us)] = &measured[..] else {
+        let remedy = "`raysweep doctor` again; if that does not help, see the frames above";
+        return checkup.unexamined(
+            DELAY,
+            NEEDED,
+            "that needs frames with two delays and their edges",
+            remedy,
+        );
+    };
+    let told_us = told_us - first_told_us;
+    let moved_us = told_us + second_us - first_us;
+    let found = format!("exposures moved by {moved_us:.1} us when told to move by {told_us:.1} us");
+    if (moved_us - told_us).abs() <= SweepPlan::default().max_jitter_us {
+        checkup.ok(DELAY, found);
+    } else {
+        checkup.failure(
+            DELAY,
+            found,
+            "check by the maker's viewer that the trigger delay acts in the mode that the rig file sets; camera.aravis.features can set what it needs",
+        );
     }
 }

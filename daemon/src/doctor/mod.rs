@@ -44,5 +44,8 @@ pub fn examine(
             SharedRig::Dots(rig) => devices::examine_dots(&mut checkup, rig, data),
         }
     }
+    if !go_on() {
+        checkup.failure("examination", "it was cancelled before its end", "`raysweep doctor` again");
+    }
     checkup.report(host::user())
 }

@@ -1,10 +1,12 @@
 //! The data folder: permission, room and speed.
 
-use std::fs::File;
+use std::fs::{self, File};
 use std::io::{self, Write};
+use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 use std::time::Instant;
 
+use nix::unistd::{Uid, User};
 use raysweep_core::{Size, io_text};
 use raysweep_session::durable;
 
@@ -23,24 +25,27 @@ const OLD_SESSIONS: &str = "`raysweep sessions` lists sessions: move old ones to
 
 pub(super) fn examine(checkup: &mut Checkup, data: &Path, needs: Option<PlanNeeds>) {
     const FOLDER: &str = "data folder";
-    let speed = match speed(data) {
+    // A folder that is missing is made by the daemon, not by who looks: its disk is that of the folder it will be in.
+    let present = data.ancestors().find(|folder| folder.exists()).unwrap_or(Path::new("."));
+    let shown = match present == data {
+        true => data.display().to_string(),
+        false => format!("{} does not exist yet: the daemon makes it", data.display()),
+    };
+    let speed = match speed(present) {
         Ok(bytes_per_s) => bytes_per_s,
         Err(error) => {
-            let found = format!("{} cannot be written: {}", data.display(), io_text(&error));
+            let found =
+                format!("{}: {} cannot be written: {}", data.display(), present.display(), io_text(&error));
             let remedy = match error.kind() {
                 io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => OLD_SESSIONS.into(),
-                _ => format!(
-                    "`mkdir -p {0} && chown {1}: {0}` as root, or give the daemon another --data",
-                    data.display(),
-                    super::host::user()
-                ),
+                _ => writable(present),
             };
             return checkup.failure(FOLDER, found, remedy);
         }
     };
-    let free_bytes = durable::available_bytes(data).unwrap_or(0);
+    let free_bytes = durable::available_bytes(present).unwrap_or(0);
     let needed_bytes = needs.map_or(LITTLE_ROOM_BYTES, |needs| needs.disk_bytes);
-    let found = format!("{}, {} free", data.display(), Size(free_bytes));
+    let found = format!("{shown}, {} free", Size(free_bytes));
     if free_bytes < needed_bytes {
         let of = if needs.is_some() { "the plan needs" } else { "a run may need" };
         let found = format!("{found}; {of} {}", Size(needed_bytes));
@@ -49,6 +54,20 @@ pub(super) fn examine(checkup: &mut Checkup, data: &Path, needs: Option<PlanNeed
         checkup.ok(FOLDER, found);
     }
     examine_speed(checkup, speed, needs);
+}
+
+/// How this user gets a data folder instead of one that they may not write, which may be anybody's.
+fn writable(folder: &Path) -> String {
+    let own = format!("give by --data a folder that {} may write", super::host::user());
+    let owner = folder.metadata().ok().filter(fs::Metadata::is_dir);
+    let owner = owner.and_then(|metadata| User::from_uid(Uid::from_raw(metadata.uid())).ok().flatten());
+    // The daemon's folder is never root's.
+    match owner.filter(|owner| owner.uid != Uid::effective() && !owner.uid.is_root()) {
+        Some(User { name, .. }) => {
+            format!("{own}, or ask as its owner: `runuser -u {name} -- raysweep doctor` as root")
+        }
+        None => own,
+    }
 }
 
 fn examine_speed(checkup: &mut Checkup, bytes_per_s: f64, needs: Option<PlanNeeds>) {
@@ -67,13 +86,12 @@ fn examine_speed(checkup: &mut Checkup, bytes_per_s: f64, needs: Option<PlanNeed
     }
 }
 
-/// Speed at which the folder's disk takes data for good, in bytes per second. Makes the folder if it is missing.
+/// Speed at which the folder's disk takes data for good, in bytes per second.
 fn speed(folder: &Path) -> io::Result<f64> {
-    std::fs::create_dir_all(folder)?;
     let path = folder.join(format!(".raysweep-doctor-{}", std::process::id()));
     let file = File::create_new(&path)?;
     // A file without a name leaves nothing behind, however this ends.
-    std::fs::remove_file(&path)?;
+    fs::remove_file(&path)?;
     write_for_good(file)
 }
 
@@ -108,18 +126,22 @@ mod tests {
         examine(&mut checkup, &data, Some(PlanNeeds { disk_bytes: u64::MAX, light_s: 10.0 }));
         let grades: Vec<Grade> = checkup.checks().iter().map(|check| check.grade).collect();
         assert_eq!(grades, [Grade::Ok, Grade::Ok, Grade::Warning, Grade::Warning]);
-        assert_eq!(std::fs::read_dir(&data).unwrap().count(), 0);
+        assert!(checkup.checks()[0].found.contains("does not exist yet"), "{:?}", checkup.checks());
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
     }
 
     #[test]
     fn a_folder_that_cannot_be_written_is_named_with_the_remedy() {
         let folder = tempfile::tempdir().unwrap();
-        let data = folder.path().join("file");
-        std::fs::write(&data, "").unwrap();
-        let mut checkup = Checkup::default();
-        examine(&mut checkup, &data, None);
-        let [check] = checkup.checks() else { panic!("one check") };
-        assert_eq!((check.name.as_str(), check.grade), ("data folder", Grade::Failure));
-        assert!(check.remedy.as_ref().unwrap().contains("chown"), "{check:?}");
+        let file = folder.path().join("file");
+        fs::write(&file, "").unwrap();
+        for data in [&file, &file.join("data")] {
+            let mut checkup = Checkup::default();
+            examine(&mut checkup, data, None);
+            let [check] = checkup.checks() else { panic!("one check") };
+            assert_eq!((check.name.as_str(), check.grade), ("data folder", Grade::Failure));
+            let remedy = check.remedy.as_ref().unwrap();
+            assert!(remedy.contains("--data") && !remedy.contains("chown"), "{check:?}");
+        }
     }
 }

@@ -143,6 +143,7 @@ pub fn advise<T: Searched>(
     });
     let Noise { read, gain, .. } = adviser.noise(planned, 1);
     let source = match rig.noise().source {
+        _ if planned.task().geometry.calibration.is_some() => NoiseSource::Calibrated,
         NoiseOrigin::Stated => NoiseSource::Stated,
         NoiseOrigin::Simulated => NoiseSource::Simulated,
         NoiseOrigin::Assumed => NoiseSource::Assumed,
@@ -320,10 +321,16 @@ impl<'a, T: Searched> Adviser<'a, T> {
 
     /// The noise of a task's images.
     fn noise(&self, of: &T, frames: u32) -> Noise {
-        let (known, white_dn) = (self.rig.noise(), of.task().geometry.white_dn);
-        let gain = 1.0 / (white_dn * known.electrons_per_dn);
-        // Rounding to counts adds a variance of 1/12 count^2.
-        let read = (known.read_noise_e * gain).hypot(12_f64.sqrt().recip() / white_dn);
+        let geometry = &of.task().geometry;
+        let (read, gain) = match &geometry.calibration {
+            Some(calibration) => (calibration.noise.read_variance.sqrt(), calibration.noise.gain),
+            None => {
+                let (known, white_dn) = (self.rig.noise(), geometry.white_dn);
+                let gain = 1.0 / (white_dn * known.electrons_per_dn);
+                // Rounding to counts adds a variance of 1/12 count^2, which measured noise contains.
+                ((known.read_noise_e * gain).hypot(12_f64.sqrt().recip() / white_dn), gain)
+            }
+        };
         let dark = unlit(of).find(|point| matches!(point.role, PointRole::Dark(_)));
         Noise { read, gain, frames, dark_frames: dark.map(|point| point.frames) }
     }

@@ -77,58 +77,34 @@ fn of_another_rig(plan: &Plan, what: &str) -> ConfigError {
     plan.places.error(&["kind"], format!("kind = \"{}\": {what}", plan.procedure.kind()))
 }
 
-/// Predicts the rest of a session, given by its folder, that was begun with this plan.
+/// Predicts the rest of a session, given by its folder, that was begun with this plan: of a kind whose sessions can be
+/// resumed ([`Procedure::past`]).
 ///
 /// # Errors
-/// If nothing can be resumed, or the plan cannot be run on this rig.
+/// If the plan cannot be run on this rig.
 pub fn foresee_rest(
     lab: &Lab<'_>,
     text: &str,
     session: &Path,
     begun: &SessionEntry,
-) -> Result<Foreseen, Unresumable> {
+) -> Result<Foreseen, ConfigError> {
     let plan = Plan::parse_stored(text)?;
     match (lab.rig, plan.procedure.clone()) {
         (SharedRig::Plane(rig), Procedure::Sweep(own)) => {
             // As it was when the session began.
             let rig = RigOfRun::of_begun(rig, begun).calibrated(lab, session)?;
-            Ok(sweep::foresee(lab, rig, &plan, own)?)
+            sweep::foresee(lab, rig, &plan, own)
         }
         (SharedRig::Plane(rig), Procedure::Patterns(own)) => {
             let rig = RigOfRun::of_begun(rig, begun).calibrated(lab, session)?;
-            Ok(patterns::foresee(lab, rig, &plan, own)?)
+            patterns::foresee(lab, rig, &plan, own)
         }
         (SharedRig::Plane(rig), Procedure::Darks(own)) => {
-            Ok(darks::foresee(lab, RigOfRun::of_begun(rig, begun), &plan, own)?)
+            darks::foresee(lab, RigOfRun::of_begun(rig, begun), &plan, own)
         }
         (SharedRig::Plane(rig), Procedure::Calibration(own)) => {
-            Ok(calibration::foresee(lab, RigOfRun::of_begun(rig, begun), &plan, own)?)
+            calibration::foresee(lab, RigOfRun::of_begun(rig, begun), &plan, own)
         }
-        (
-            _,
-            past @ (Procedure::Film(_)
-            | Procedure::Batches(_)
-            | Procedure::Response(_)
-            | Procedure::Viewfinder(_)),
-        ) => Err(Unresumable::Past(past.past().unwrap_or_default())),
-        (
-            SharedRig::Dots(_),
-            Procedure::Sweep(_) | Procedure::Patterns(_) | Procedure::Darks(_) | Procedure::Calibration(_),
-        ) => Err(of_another_rig(
-            &plan,
-            "a dot rig runs plans of kind \"batches\", \"response\" and \"viewfinder\"",
-        )
-        .into()),
+        _ => Err(of_another_rig(&plan, "no session of it can be resumed on this rig")),
     }
-}
-
-/// Why a session cannot be resumed.
-#[derive(Debug, thiserror::Error)]
-pub enum Unresumable {
-    /// The event that it recorded is over.
-    #[error("{0}")]
-    Past(&'static str),
-    /// Its plan cannot be run.
-    #[error(transparent)]
-    Plan(#[from] ConfigError),
 }

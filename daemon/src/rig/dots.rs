@@ -214,6 +214,7 @@ impl DotRig {
             trigger_period_us: period_us,
             trigger_margin_us: period_us / 8.0,
             reopen: Duration::from_secs_f64(camera.reopen_s),
+            free_hz: None,
         };
         Ok(Box::new(AravisCamera::open(&camera.aravis, facts)?))
     }

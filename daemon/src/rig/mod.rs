@@ -408,10 +408,9 @@ impl Rig {
             trigger_period_us: vsync.period_us,
             trigger_margin_us: vsync.gate_us,
             reopen: Duration::from_secs_f64(camera.reopen_s),
+            free_hz,
         };
-        let own = &camera.aravis;
-        let config = free_hz.map_or_else(|| own.clone(), |free_hz| own.free_running(free_hz));
-        Ok(Box::new(AravisCamera::open(&config, facts)?))
+        Ok(Box::new(AravisCamera::open(&camera.aravis, facts)?))
     }
 
     #[cfg(not(feature = "aravis"))]

@@ -75,8 +75,8 @@ impl Access {
         let message =
             format!("`{name}` is reserved for operators, and the user with id {} is an observer", peer.uid);
         let help = match &self.operators {
-            Some(group) => format!("join the group `{group}` (`usermod -aG {group} USER` as root)"),
-            None => "call it as root or as the daemon's own user; no group of operators is set".into(),
+            Some(group) if group != "root" => format!("join the group `{group}` (`usermod -aG {group} USER` as root)"),
+            _ => "call it as root or as the daemon's own user; `raysweepd --group NAME` names a group of operators".into(),
         };
         RpcError::new(ErrorCode::Forbidden, format!("{message}: {help}")).with_help(help)
     }
@@ -138,5 +138,7 @@ mod tests {
         let error = access(Some("raysweep")).forbidden(Method::Run, STRANGER);
         assert_eq!(error.name(), Some(ErrorCode::Forbidden));
         assert!(error.data.is_some_and(|data| data.help.is_some_and(|help| help.contains("raysweep"))));
+        let error = access(Some("root")).forbidden(Method::Run, STRANGER);
+        assert!(!error.message.contains("usermod") && error.message.contains("--group"), "{error}");
     }
 }

@@ -23,9 +23,6 @@ pub struct AravisConfig {
     pub black_level: Option<f64>,
     /// The trigger input, or `off` for a free-running camera.
     pub trigger_source: String,
-    /// Frames per second of a free-running camera; not a key: a viewfinder's plan says it. Default: the camera's.
-    #[serde(skip)]
-    pub free_hz: Option<f64>,
     /// The edge that triggers.
     pub trigger_activation: String,
     /// From the trigger edge to the start of row 0's exposure, at a trigger delay of zero.
@@ -84,7 +81,6 @@ impl Default for AravisConfig {
             binning: [1, 1],
             black_level: None,
             trigger_source: "Line0".into(),
-            free_hz: None,
             trigger_activation: "RisingEdge".into(),
             trigger_latency_us: 0.0,
             readout: Readout::Sequential,
@@ -115,12 +111,6 @@ impl AravisConfig {
     /// Whether frames wait for a trigger.
     pub fn is_triggered(&self) -> bool {
         self.trigger_source != "off"
-    }
-
-    /// The same camera without its trigger, at this frame rate if it can be set.
-    #[must_use]
-    pub fn free_running(&self, free_hz: f64) -> Self {
-        Self { trigger_source: "off".into(), free_hz: Some(free_hz), ..self.clone() }
     }
 
     /// Faults that can be found without the camera.

@@ -106,7 +106,7 @@ mod tests {
     use ndarray::{Array2, concatenate, s};
     use raysweep_core::{Counts, Raster, SettingsId};
     use raysweep_transport::plane::board::{BoardCalibration, CalibrationCovariance, Estimate};
-    use raysweep_transport::plane::{PixelResponse, RESPONSE_ROWS, Setting};
+    use raysweep_transport::plane::{NoiseModel, PixelResponse, RESPONSE_ROWS, Setting};
 
     use super::*;
     use crate::demux::{DemuxOptions, Solved};
@@ -251,6 +251,7 @@ mod tests {
             covariance: CalibrationCovariance::independent([0.0; 5]),
             response: PixelResponse::with_beam(places, &shares).unwrap(),
             white_dn,
+            noise: NoiseModel { read_variance: 0.0, gain: 0.0 },
             strip: None,
             lamp: None,
         }))

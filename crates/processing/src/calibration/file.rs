@@ -363,11 +363,7 @@ impl KeptCalibration {
                 format!("calibration.strip_columns = [{first}, {end}]: the camera has {columns} columns");
             return Err(rig.places.error(&["calibration", "strip_columns"], message));
         }
-        let CalibratedLight { white_dn: [white_dn, _], electrons_per_dn: [gain, _], read_noise_e, .. } =
-            self.header.light;
-        let white_e = white_dn * gain;
-        let noise = NoiseModel { read_variance: (read_noise_e[0] / white_e).powi(2), gain: white_e.recip() };
-        Ok(Some(BoardStrip { columns: first..end, noise, jitter_us: self.header.timing.jitter_us[0] }))
+        Ok(Some(BoardStrip { columns: first..end, jitter_us: self.header.timing.jitter_us[0] }))
     }
 
     /// The calibration as the model uses it.
@@ -376,6 +372,9 @@ impl KeptCalibration {
     /// When the arrays hold no usable response.
     fn board(&self, strip: Option<BoardStrip>) -> Result<Arc<BoardCalibration>, ConfigError> {
         let CalibratedTiming { camera_row_time_us, exposure_offset_us, jitter_us, .. } = self.header.timing;
+        let CalibratedLight { white_dn: [white_dn, _], electrons_per_dn: [gain, _], read_noise_e, .. } =
+            self.header.light;
+        let white_e = white_dn * gain;
         let response = PixelResponse::new(self.arrays.place.clone(), self.arrays.response.clone())
             .map_err(|error| ConfigError::of_field("calibration", error.to_string()))?;
         Ok(Arc::new(BoardCalibration {
@@ -386,6 +385,7 @@ impl KeptCalibration {
             covariance: self.covariance(),
             response,
             white_dn: self.arrays.white_dn.clone(),
+            noise: NoiseModel { read_variance: (read_noise_e[0] / white_e).powi(2), gain: white_e.recip() },
             strip,
             lamp: self.header.ambient.as_ref().and_then(CalibratedAmbient::lamp),
         }))

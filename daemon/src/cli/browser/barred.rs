@@ -18,6 +18,11 @@ pub(super) fn barred(path: &Path) -> Option<String> {
     let group = Group::from_gid(Gid::from_raw(metadata.gid())).ok().flatten();
     let shown = barrier.display();
     Some(match group.filter(|_| metadata.mode() & 0o040 != 0) {
+        // Who joins that group gets far more than sessions.
+        Some(_) if metadata.gid() == 0 => format!(
+            "only root may read {shown}: have root run raysweepd by its service, whose sessions members of the group \
+             `raysweep` may read, or ask root for a copy"
+        ),
         Some(Group { name, .. }) => format!(
             "only members of the group `{name}` may read {shown}: have root add you (`usermod -aG {name} USER`), \
              log in again and restart `raysweep view`, or ask one of them"

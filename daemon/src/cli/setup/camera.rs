@@ -15,6 +15,9 @@ const SIM: &str = "sim";
 /// The longest side of a frame.
 const MOST_PX: u32 = 65_536;
 
+/// Names and values of controls.
+type Controls = Vec<(String, i64)>;
+
 /// The camera of the new rig.
 pub(super) enum ChosenCamera {
     Sim,
@@ -29,7 +32,9 @@ pub(super) enum ChosenCamera {
         device: String,
         format: PixelFormat,
         size: (usize, usize),
-        controls: Vec<(String, i64)>,
+        controls: Controls,
+        /// Written after them by a viewfinder without the trigger.
+        free_running: Controls,
         delay: Option<String>,
     },
 }
@@ -59,16 +64,23 @@ impl ChosenCamera {
         choices.push(AnswerChoice::new(SIM, "simulated, to rehearse"));
         let default = choices[0].value.clone();
         let forms = ["genicam:NAME or ADDRESS", "v4l2:NODE"];
-        let chosen = questions.choose("camera", "Which camera?", &choices, &forms, Some(&default))?;
-        let known = connected.cameras.iter().find(|eye| eye.value == chosen);
-        let known = known.and_then(|eye| eye.facts.clone());
-        match chosen.split_once(':') {
-            Some((GENICAM, named)) => {
-                let facts = known.map_or_else(|| offered_by_genicam(named), Ok)?;
-                Self::genicam(questions, named, &facts, most_rows)
-            }
-            Some((V4L2, device)) => Self::v4l2(questions, device, &known.unwrap_or_default(), most_rows),
-            _ => Ok(Self::Sim),
+        loop {
+            let chosen = questions.choose("camera", "Which camera?", &choices, &forms, Some(&default))?;
+            let known = connected.cameras.iter().find(|eye| eye.is(&chosen));
+            let chosen = known.map_or(chosen, |eye| eye.value.clone());
+            let known = known.and_then(|eye| eye.facts.clone());
+            return match chosen.split_once(':') {
+                Some((GENICAM, named)) => match known.map_or_else(|| offered_by_genicam(named), Ok) {
+                    Ok(facts) => Self::genicam(questions, named, &facts, most_rows),
+                    Err(error) if matches!(questions, Questions::Terminal) => {
+                        println!("{error}");
+                        continue;
+                    }
+                    Err(error) => Err(error),
+                },
+                Some((V4L2, device)) => Self::v4l2(questions, device, &known.unwrap_or_default(), most_rows),
+                _ => Ok(Self::Sim),
+            };
         }
     }
 
@@ -132,21 +144,31 @@ impl ChosenCamera {
         most_rows: Option<usize>,
     ) -> Result<Self, CommandFailure> {
         let format = ask_format(questions, facts)?;
+        let is_plane = most_rows.is_some();
         let most_rows = most_rows.and_then(|rows| u32::try_from(rows).ok()).unwrap_or(MOST_PX);
         let size = ask_size(questions, facts, format, most_rows)?;
-        let controls = questions.text(
+        let controls = questions.read(
             "controls",
             "Controls that set the external trigger and fix the gain, as `v4l2-ctl --list-ctrls` spells them: NAME=VALUE, ... (empty: none)",
             "",
+            parse_controls,
         )?;
-        let controls = parse_controls(&controls)?;
+        let free_running = match is_plane && !controls.is_empty() {
+            true => questions.read(
+                "free_running",
+                "Controls that end the external trigger, for a viewfinder before the VSYNC is wired: NAME=VALUE, ... (empty: none)",
+                &without_trigger(&controls),
+                parse_controls,
+            )?,
+            false => Controls::new(),
+        };
         let delay = questions.text(
             "trigger_delay",
             "The control that delays the trigger, in microseconds (empty: none; delays can then not be swept)",
             "",
         )?;
         let delay = (!delay.is_empty()).then_some(delay);
-        Ok(Self::V4l2 { device: device.into(), format, size, controls, delay })
+        Ok(Self::V4l2 { device: device.into(), format, size, controls, free_running, delay })
     }
 
     /// Whether it is simulated.
@@ -193,12 +215,11 @@ impl ChosenCamera {
                         "[A] what the camera's time stamps refer to; see its data sheet",
                     )
             }
-            Self::V4l2 { device, format, size: (rows, columns), controls, delay } => {
+            Self::V4l2 { device, format, size: (rows, columns), controls, free_running, delay } => {
                 let text = levels(text.key("driver", V4L2).key("pixel_format", format.to_string()));
-                let controls: Vec<Value> = controls
-                    .iter()
-                    .map(|(name, value)| Value::Array(vec![name.as_str().into(), (*value).into()]))
-                    .collect();
+                let pair =
+                    |(name, value): &(String, i64)| vec![Value::from(name.as_str()), (*value).into()].into();
+                let list = |controls: &Controls| controls.iter().map(pair).collect::<Vec<Value>>();
                 let text = text
                     .table("camera.v4l2")
                     .key_with("device", device.as_str(), "a path below /dev/v4l/by-id stays with the camera")
@@ -206,9 +227,17 @@ impl ChosenCamera {
                     .key("height", *rows as i64)
                     .key_with(
                         "controls",
-                        controls,
+                        list(controls),
                         "written in this order; also switch automatic functions off here",
                     );
+                let text = match free_running.is_empty() {
+                    true => text,
+                    false => text.key_with(
+                        "free_running",
+                        list(free_running),
+                        "of a viewfinder before the VSYNC is wired",
+                    ),
+                };
                 match delay {
                     Some(control) => {
                         let table = Table::from_iter([
@@ -234,16 +263,18 @@ fn region_of([x, y, width, height]: [u32; 4]) -> Table {
     sides.into_iter().map(|(name, pixels)| (name.to_owned(), Value::from(i64::from(pixels)))).collect()
 }
 
-fn parse_controls(text: &str) -> Result<Vec<(String, i64)>, CommandFailure> {
+/// The controls of a trigger, switched off as most makers do it.
+fn without_trigger(controls: &Controls) -> String {
+    let of_trigger = controls.iter().filter(|(name, value)| name.contains("trigger_mode") && *value != 0);
+    of_trigger.map(|(name, _)| format!("{name}=0")).collect::<Vec<_>>().join(", ")
+}
+
+fn parse_controls(text: &str) -> Result<Controls, String> {
     let control = |part: &str| {
         let parsed = part
             .split_once('=')
             .and_then(|(name, value)| Some((name.trim().to_owned(), value.trim().parse().ok()?)));
-        parsed.ok_or_else(|| {
-            CommandFailure::Setup(format!(
-                "controls: {part:?}; allowed: NAME=WHOLE NUMBER, separated by commas"
-            ))
-        })
+        parsed.ok_or_else(|| format!("{part:?} is not NAME=WHOLE NUMBER; separate several by commas"))
     };
     text.split(',').map(str::trim).filter(|part| !part.is_empty()).map(control).collect()
 }
@@ -265,15 +296,19 @@ fn ask_format(questions: &mut Questions, facts: &CameraFacts) -> Result<PixelFor
         formats.iter().map(|format| AnswerChoice::new(format.to_string(), "")).collect();
     const KEY: &str = "pixel_format";
     let question = "Which pixel format? 12 bits are best; packed ones need less of the link";
-    let name = match choices.first() {
-        Some(first) => questions.choose(KEY, question, &choices, &[], Some(&first.value))?,
-        None => questions.text(KEY, question, "Mono12")?,
-    };
-    name.parse()
-        .map_err(|error: raysweep_core::UnknownPixelFormat| CommandFailure::Setup(format!("{KEY}: {error}")))
+    let known =
+        |name: &str| name.parse().map_err(|error: raysweep_core::UnknownPixelFormat| error.to_string());
+    match choices.first() {
+        Some(first) => {
+            let name = questions.choose(KEY, question, &choices, &[], Some(&first.value))?;
+            known(&name).map_err(CommandFailure::Setup)
+        }
+        None => questions.read(KEY, question, "Mono12", known),
+    }
 }
 
-/// Rows and columns of a frame of this format: by default its first size that does not have too many rows.
+/// Rows and columns of a frame of this format: by default its first size that does not have too many rows, and of the
+/// chosen width.
 fn ask_size(
     questions: &mut Questions,
     facts: &CameraFacts,
@@ -281,10 +316,18 @@ fn ask_size(
     most_rows: u32,
 ) -> Result<(usize, usize), CommandFailure> {
     let sizes = facts.formats.iter().find(|(of, _)| *of == format).map_or(&[][..], |(_, sizes)| sizes);
-    let fitting = sizes.iter().find(|(rows, _)| *rows <= most_rows).or(sizes.first());
-    let (rows, columns) = fitting.copied().unwrap_or((720, 1280));
+    let mut fitting = sizes.iter().filter(|(rows, _)| *rows <= most_rows);
+    let first = fitting.clone().next().or(sizes.first()).copied();
+    let (rows, columns) = first.unwrap_or((720, 1280));
     let width = questions.whole("width", "Columns of a frame", columns, 1..=MOST_PX)?;
-    let height = questions.whole("height", "Rows of a frame", rows.min(most_rows), 1..=most_rows)?;
+    let rows = fitting.find(|(_, columns)| *columns == width).map_or(rows, |(rows, _)| *rows);
+    let question = match first.is_some() && rows > most_rows {
+        false => "Rows of a frame",
+        true => {
+            "Rows of a frame. The camera lists no size with as few rows as the projector draws: crop it to them, or choose another format"
+        }
+    };
+    let height = questions.whole("height", question, rows.min(most_rows), 1..=most_rows)?;
     Ok((height as usize, width as usize))
 }
 
@@ -310,12 +353,15 @@ mod tests {
         let facts = CameraFacts { formats, ..CameraFacts::default() };
         let size = |format, most_rows, answers: &str| {
             let answers = answers.parse().unwrap();
-            let mut questions = Questions::File { path: "answers.toml".into(), answers };
-            ask_size(&mut questions, &facts, format, most_rows)
+            let mut questions =
+                Questions::File { path: "answers.toml".into(), answers, mistakes: Vec::new() };
+            let size = ask_size(&mut questions, &facts, format, most_rows)?;
+            questions.finish().map(|()| size)
         };
         assert_eq!(size(mono8, 720, "").unwrap(), (480, 640));
         assert_eq!(size(mono10, 720, "").unwrap(), (720, 1280));
         assert_eq!(size(mono10, MOST_PX, "").unwrap(), (1080, 1920));
+        assert_eq!(size(mono10, MOST_PX, "width = 1280").unwrap(), (720, 1280), "the rows of that width");
         let refused = size(mono10, 720, "height = 1080").unwrap_err().to_string();
         assert!(refused.contains("height = 1080; allowed: 1 to 720"), "{refused}");
         assert_eq!(size("Mono12".parse().unwrap(), 480, "").unwrap(), (480, 1280), "nothing is known of it");

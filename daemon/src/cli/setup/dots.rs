@@ -66,11 +66,13 @@ fn write_mirror(
     let text = text.key_with("full_scale_deg", full_scale_deg, "mechanical; from the mirror's data sheet");
     let text = write_limits(questions, text, full_scale_deg)?;
     let text = if driver == "optotune" {
-        let laser = questions.text("laser_port", "Serial port whose RTS line enables the laser", "")?;
-        if laser.is_empty() {
-            let what = "laser_port is missing: an Optotune mirror's laser is enabled by the RTS line of a serial port";
-            return Err(CommandFailure::Setup(what.into()));
-        }
+        let question = "Serial port whose RTS line enables the laser";
+        let laser = questions.read("laser_port", question, "", |port| match port {
+            "" => {
+                Err("an Optotune mirror's laser is enabled by the RTS line of a serial port: name it".into())
+            }
+            port => Ok(port.to_owned()),
+        })?;
         text.key("laser_port", laser)
     } else {
         text

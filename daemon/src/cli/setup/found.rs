@@ -1,7 +1,7 @@
 //! What is connected, for people, for programs, and as choices.
 
 use std::fmt::Write as _;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use raysweep_drivers::camera::CameraFacts;
 use raysweep_drivers::search::{
@@ -24,6 +24,12 @@ pub(super) struct FoundEye {
 }
 
 impl FoundEye {
+    /// Whether an answer means this camera, by its value or by another path of its node.
+    pub fn is(&self, answer: &str) -> bool {
+        let node = |value: &str| Path::new(value.strip_prefix("v4l2:")?).canonicalize().ok();
+        self.value == answer || node(answer).is_some_and(|of| node(&self.value) == Some(of))
+    }
+
     /// A line for what it is, and one each for its sizes and limits.
     fn lines(&self) -> Vec<String> {
         let mut lines = vec![format!("{}  {}", self.value, self.about)];

@@ -91,7 +91,7 @@ fn ask_ports(
     is_spoken: bool,
 ) -> Result<(), CommandFailure> {
     let ports: Vec<PathBuf> = connected.serial_ports.iter().map(|port| port.path.clone()).collect();
-    let chosen = questions.paths(
+    let chosen = questions.ports(
         "ask_ports",
         "Ask serial ports for mirror controllers and triggerboxes? That resets some boards, and may confuse other devices, so name only ports whose device you know to be one of these",
         &ports,

@@ -1,6 +1,5 @@
 //! The questions about a plane rig.
 
-use std::ops::RangeInclusive;
 use std::path::PathBuf;
 
 use raysweep_drivers::search::Answering;
@@ -16,7 +15,8 @@ use crate::cli::failure::CommandFailure;
 const LINES_PER_ROW: f64 = 750.0 / 720.0;
 /// Of the lines without a row, the part that is before the first one.
 const BEFORE_PER_ROW: f64 = 25.0 / 720.0;
-const ROW_TIME_US: RangeInclusive<f64> = 0.1..=10_000.0;
+const SHORTEST_ROW_TIME_US: f64 = 0.1;
+const LONGEST_ROW_TIME_US: f64 = 10_000.0;
 
 const SIM: &str = "sim";
 const BENCH: &str = "bench";
@@ -31,18 +31,21 @@ pub(super) fn ask(questions: &mut Questions, connected: &ConnectedDevices) -> Re
     let vsync = ask_vsync(questions, connected, &camera)?;
     let period_us = 1e6 / rate_hz;
     let row_time_us = period_us / (f64::from(rows) * LINES_PER_ROW);
-    let row_time_us = row_time_us.clamp(*ROW_TIME_US.start(), *ROW_TIME_US.end());
+    // All rows are drawn before the next edge.
+    let longest_us = floored(rounded(period_us) / f64::from(rows)).min(LONGEST_ROW_TIME_US);
+    let row_time_us = row_time_us.clamp(SHORTEST_ROW_TIME_US, longest_us);
     let row_time_us = questions.number(
         "row_time_us",
         "Microseconds from one row of the projector to the next (`raysweep calibrate` measures it)",
         rounded(row_time_us),
-        ROW_TIME_US,
+        SHORTEST_ROW_TIME_US..=longest_us,
     )?;
+    let latest_us = floored(rounded(period_us) - f64::from(rows) * row_time_us).max(0.0);
     let first_row_us = questions.number(
         "first_row_us",
         "Microseconds from the VSYNC edge to the first row (`raysweep calibrate` measures it)",
-        rounded(BEFORE_PER_ROW * f64::from(rows) * row_time_us).min(period_us),
-        0.0..=rounded(period_us),
+        rounded(BEFORE_PER_ROW * f64::from(rows) * row_time_us).min(latest_us),
+        0.0..=latest_us,
     )?;
     let text = camera.write(RigText::new("plane"));
     let text = write_vsync(text.table("vsync"), &vsync, period_us, questions)?;
@@ -212,6 +215,11 @@ fn write_projector(text: RigText, projector: &str) -> RigText {
         None if projector == "external" => text.key("driver", "external"),
         None => text.key("driver", SIM),
     }
+}
+
+/// To a thousandth of a microsecond, and no more.
+fn floored(us: f64) -> f64 {
+    (us * 1e3).floor() / 1e3
 }
 
 /// To a thousandth of a microsecond.

@@ -1,10 +1,13 @@
 //! Questions to an operator at a terminal, or to a file of answers.
 
 use std::fmt::Write as _;
+use std::fs;
 use std::io::{self, BufRead, IsTerminal, Write};
 use std::ops::RangeInclusive;
+use std::os::unix::fs::{FileTypeExt, MetadataExt};
 use std::path::{Path, PathBuf};
 
+use nix::sys::stat;
 use toml::{Table, Value};
 
 use crate::cli::failure::CommandFailure;
@@ -26,8 +29,8 @@ impl AnswerChoice {
 
 /// Asks a person, or a file.
 pub(super) enum Questions {
-    /// The answers of a file that are not asked for yet.
-    File { path: PathBuf, answers: Table },
+    /// The answers of a file that are not asked for yet, and what is wrong with others.
+    File { path: PathBuf, answers: Table, mistakes: Vec<String> },
     /// A person.
     Terminal,
 }
@@ -53,7 +56,7 @@ impl Questions {
         let text = read_small(path)?;
         let parsed: Result<Table, _> = text.parse();
         match parsed {
-            Ok(answers) => Ok(Self::File { path: path.to_owned(), answers }),
+            Ok(answers) => Ok(Self::File { path: path.to_owned(), answers, mistakes: Vec::new() }),
             Err(error) => refused(format!("{}: {}", path.display(), in_place(&text, &error))),
         }
     }
@@ -71,18 +74,21 @@ impl Questions {
         let fits = |value: &str| {
             choices.iter().any(|choice| choice.value == value)
                 || forms.iter().any(|form| {
-                    let kind = form.split_once(':').map_or(*form, |(kind, _)| kind);
-                    value.split_once(':').is_some_and(|(of, name)| of == kind && !name.is_empty())
+                    let parts: Vec<&str> = value.splitn(form.split(':').count(), ':').collect();
+                    parts.len() > 1
+                        && form.split(':').next() == parts.first().copied()
+                        && parts.iter().all(|part| !part.is_empty())
                 })
         };
         let values = choices.iter().map(|choice| choice.value.as_str()).chain(forms.iter().copied());
         let allowed = format!("allowed: {}", values.collect::<Vec<_>>().join(", "));
         if let Self::File { .. } = self {
-            let given = self.given(key, "a string", |value| value.as_str().map(str::to_owned))?;
+            let given = self.given(key, "a string", |value| value.as_str().map(str::to_owned));
+            // What is asked next depends on it.
             return match given.or_else(|| default.map(str::to_owned)) {
                 Some(value) if fits(&value) => Ok(value),
-                Some(value) => refused(format!("{}{key} = {:?}; {allowed}", self.place(), short(&value))),
-                None => refused(format!("{}{key} is missing: {question}; {allowed}", self.place())),
+                Some(value) => Err(self.ended_by(&format!("{key} = {:?}; {allowed}", short(&value)))),
+                None => Err(self.ended_by(&format!("{key} is missing: {question}; {allowed}"))),
             };
         }
         let mut prompt = format!("{question}\n");
@@ -114,11 +120,12 @@ impl Questions {
         let range = format!("allowed: {} to {}", allowed.start(), allowed.end());
         if let Self::File { .. } = self {
             let number = |value: &Value| value.as_float().or(value.as_integer().map(|whole| whole as f64));
-            let value = self.given(key, "a number", number)?.unwrap_or(default);
-            return match allowed.contains(&value) {
-                true => Ok(value),
-                false => refused(format!("{}{key} = {value}; {range}", self.place())),
-            };
+            let value = self.given(key, "a number", number).unwrap_or(default);
+            if !allowed.contains(&value) {
+                self.note(&format!("{key} = {value}; {range}"));
+                return Ok(default);
+            }
+            return Ok(value);
         }
         let mut prompt = format!("{question}, {range}\n");
         loop {
@@ -144,7 +151,10 @@ impl Questions {
             let value = self.number(key, question, f64::from(default), f64::from(first)..=f64::from(last))?;
             match self {
                 _ if value.fract() == 0.0 => return Ok(value as u32),
-                Self::File { .. } => return refused(format!("{}{key} = {value}; {allowed}", self.place())),
+                Self::File { .. } => {
+                    self.note(&format!("{key} = {value}; {allowed}"));
+                    return Ok(default);
+                }
                 Self::Terminal => println!("{value} is no whole number; {allowed}"),
             }
         }
@@ -153,29 +163,53 @@ impl Questions {
     /// Asks for a text, which may be empty if the default is.
     pub fn text(&mut self, key: &str, question: &str, default: &str) -> Answer<String> {
         if let Self::File { .. } = self {
-            let given = self.given(key, "a string", |value| value.as_str().map(str::to_owned))?;
+            let given = self.given(key, "a string", |value| value.as_str().map(str::to_owned));
             return Ok(given.unwrap_or_else(|| default.into()));
         }
         asked(&format!("{question}\n"), Some(default))
     }
 
-    /// Asks which paths to take, none by default; `choices` are those that were found.
-    pub fn paths(&mut self, key: &str, question: &str, choices: &[PathBuf]) -> Answer<Vec<PathBuf>> {
-        let missing = |paths: &[PathBuf]| paths.iter().find(|path| !path.exists()).cloned();
+    /// Asks for a text that means something: `read` says what, or what is wrong with it.
+    pub fn read<T>(
+        &mut self,
+        key: &str,
+        question: &str,
+        default: &str,
+        read: impl Fn(&str) -> Result<T, String>,
+    ) -> Answer<T> {
+        loop {
+            let text = self.text(key, question, default)?;
+            match (read(&text), &self) {
+                (Ok(value), _) => return Ok(value),
+                (Err(what), Self::Terminal) => println!("{text:?}: {what}"),
+                (Err(what), Self::File { .. }) => {
+                    let what = format!("{key} = {text:?}: {what}");
+                    let Ok(instead) = read(default) else { return Err(self.ended_by(&what)) };
+                    self.note(&what);
+                    return Ok(instead);
+                }
+            }
+        }
+    }
+
+    /// Asks which serial ports to take, none by default; `choices` are those that were found.
+    pub fn ports(&mut self, key: &str, question: &str, choices: &[PathBuf]) -> Answer<Vec<PathBuf>> {
+        let wrong = |paths: &[PathBuf]| {
+            paths.iter().find_map(|path| {
+                Some(format!("{}: {}", short(&path.to_string_lossy()), no_serial_port(path)?))
+            })
+        };
         if let Self::File { .. } = self {
             let strings = |value: &Value| {
                 let values = value.as_array()?.iter();
                 values.map(|value| value.as_str().map(PathBuf::from)).collect::<Option<Vec<_>>>()
             };
-            let paths = self.given(key, "a list of strings", strings)?.unwrap_or_default();
-            return match missing(&paths) {
-                Some(path) => refused(format!(
-                    "{}{key}: {}: there is no such file; allowed: paths of serial ports, such as /dev/ttyUSB0",
-                    self.place(),
-                    short(&path.to_string_lossy())
-                )),
-                None => Ok(paths),
-            };
+            let paths = self.given(key, "a list of strings", strings).unwrap_or_default();
+            if let Some(what) = wrong(&paths) {
+                self.note(&format!("{key}: {what}; allowed: paths of serial ports, such as /dev/ttyUSB0"));
+                return Ok(Vec::new());
+            }
+            return Ok(paths);
         }
         if choices.is_empty() {
             return Ok(Vec::new());
@@ -190,10 +224,8 @@ impl Questions {
                 "all" => choices.to_vec(),
                 paths => paths.split_whitespace().map(PathBuf::from).collect(),
             };
-            match missing(&paths) {
-                Some(path) => {
-                    prompt = format!("{}: there is no such file; allowed: {allowed}\n", path.display())
-                }
+            match wrong(&paths) {
+                Some(what) => prompt = format!("{what}; allowed: {allowed}\n"),
                 None => return Ok(paths),
             }
         }
@@ -202,9 +234,10 @@ impl Questions {
     /// Ends the questions.
     ///
     /// # Errors
-    /// For answers of a file to questions that were not asked.
+    /// For all answers of a file that were wrong, or, if none was, for those to questions that were not asked.
     pub fn finish(self) -> Answer<()> {
         match &self {
+            Self::File { mistakes, .. } if !mistakes.is_empty() => refused(mistakes.join("\n")),
             Self::File { answers, .. } if !answers.is_empty() => {
                 let keys: Vec<&str> = answers.keys().map(String::as_str).collect();
                 let keys = short(&keys.join(", "));
@@ -215,14 +248,29 @@ impl Questions {
     }
 
     /// The answer of a file to `key`, if it has one.
-    fn given<T>(&mut self, key: &str, wanted: &str, read: impl Fn(&Value) -> Option<T>) -> Answer<Option<T>> {
-        let place = self.place();
-        let Self::File { answers, .. } = self else { return Ok(None) };
-        let Some(value) = answers.remove(key) else { return Ok(None) };
-        match read(&value) {
-            Some(given) => Ok(Some(given)),
-            None => refused(format!("{place}{key} = {}; allowed: {wanted}", short(&value.to_string()))),
+    fn given<T>(&mut self, key: &str, wanted: &str, read: impl Fn(&Value) -> Option<T>) -> Option<T> {
+        let Self::File { answers, .. } = self else { return None };
+        let value = answers.remove(key)?;
+        let given = read(&value);
+        if given.is_none() {
+            self.note(&format!("{key} = {}; allowed: {wanted}", short(&value.to_string())));
         }
+        given
+    }
+
+    /// Notes what is wrong with an answer of a file, so that all mistakes are told at once.
+    fn note(&mut self, what: &str) {
+        let what = format!("{}{what}", self.place());
+        if let Self::File { mistakes, .. } = self {
+            mistakes.push(what);
+        }
+    }
+
+    /// The mistakes of a file, up to one without whose answer the questions cannot go on.
+    fn ended_by(&mut self, what: &str) -> CommandFailure {
+        self.note(what);
+        let Self::File { mistakes, .. } = self else { return CommandFailure::Setup(what.into()) };
+        CommandFailure::Setup(mistakes.join("\n"))
     }
 
     fn place(&self) -> String {
@@ -252,6 +300,16 @@ fn in_place(text: &str, error: &toml::de::Error) -> String {
     format!("{line}{}", error.message())
 }
 
+/// Why a path cannot be a serial port's; tells it without opening what may be there.
+fn no_serial_port(path: &Path) -> Option<&'static str> {
+    let Ok(metadata) = path.metadata() else { return Some("there is no such file") };
+    let (major, minor) = (stat::major(metadata.rdev()), stat::minor(metadata.rdev()));
+    // Pseudo-terminals are not listed there.
+    let subsystem = fs::read_link(format!("/sys/dev/char/{major}:{minor}/subsystem"));
+    let is_other = subsystem.is_ok_and(|subsystem| !subsystem.ends_with("tty"));
+    (!metadata.file_type().is_char_device() || is_other).then_some("this is no serial port")
+}
+
 /// One line of the person at the terminal; nothing stands for the default.
 fn asked(prompt: &str, default: Option<&str>) -> Answer<String> {
     let shown = default.filter(|default| !default.is_empty());
@@ -278,7 +336,8 @@ mod tests {
     use super::*;
 
     fn questions(answers: &str) -> Questions {
-        Questions::File { path: "answers.toml".into(), answers: answers.parse().unwrap() }
+        let (answers, mistakes) = (answers.parse().unwrap(), Vec::new());
+        Questions::File { path: "answers.toml".into(), answers, mistakes }
     }
 
     fn message<T: std::fmt::Debug>(answer: Answer<T>) -> String {
@@ -296,21 +355,38 @@ mod tests {
         assert_eq!(choose("", Some("sim")).unwrap(), "sim");
         for (wrong, part) in [
             ("vsync = 'pps:'", "answers.toml: vsync = \"pps:\"; allowed: sim, pps:SOURCE"),
+            ("vsync = 'ppsource'", "allowed: sim, pps:SOURCE"),
             ("vsync = 1", "allowed: a string"),
             ("", "vsync is missing: What watches?; allowed: sim, pps:SOURCE"),
         ] {
             let found = message(choose(wrong, None));
             assert!(found.contains(part), "{found}");
         }
-        let number = |text: &str| questions(text).number("rows", "Rows?", 720.0, 1.0..=8192.0);
+        let number = |text: &str| {
+            let mut questions = questions(text);
+            let number = questions.number("rows", "Rows?", 720.0, 1.0..=8192.0)?;
+            questions.finish().map(|()| number)
+        };
         assert_eq!((number("rows = 360").unwrap(), number("").unwrap()), (360.0, 720.0));
         assert!(message(number("rows = nan")).contains("allowed: 1 to 8192"));
         assert!(message(number("rows = 'many'")).contains("a number"));
-        let whole = |text: &str| questions(text).whole("rows", "Rows?", 720, 1..=8192);
+        let whole = |text: &str| {
+            let mut questions = questions(text);
+            let whole = questions.whole("rows", "Rows?", 720, 1..=8192)?;
+            questions.finish().map(|()| whole)
+        };
         assert_eq!(whole("rows = 360.0").unwrap(), 360);
         assert!(message(whole("rows = 1.5")).contains("allowed: whole numbers, 1 to 8192"));
         let long = message(choose(&format!("vsync = '{}'", "x".repeat(1 << 20)), None));
         assert!(long.len() < 300 && long.contains("xxx…"), "{} bytes", long.len());
+        let drm = |text: &str| {
+            let mut questions = questions(&format!("projector = '{text}'"));
+            questions.choose("projector", "What drives it?", &[], &["drm:CARD:CONNECTOR"], None)
+        };
+        assert_eq!(drm("drm:/dev/dri/card0:HDMI-A-1").unwrap(), "drm:/dev/dri/card0:HDMI-A-1");
+        for wrong in ["drm", "drm:", "drm::", "drm::HDMI-A-1", "drm:/dev/dri/card0:"] {
+            assert!(message(drm(wrong)).contains("allowed: drm:CARD:CONNECTOR"), "{wrong}");
+        }
         assert!(message(questions("colour = 'red'").finish()).contains("colour: not asked for"));
     }
 }

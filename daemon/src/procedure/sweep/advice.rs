@@ -49,10 +49,15 @@ impl Searched for SweepTask {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
+    use ndarray::Array2;
     use raysweep_config::{Plan, Procedure, RigFile};
     use raysweep_core::{CameraCapabilities, PixelFormat, Readout};
     use raysweep_processing::plane::KnownRig;
-    use raysweep_proto::{DesignParams, PlanAdvice};
+    use raysweep_proto::{DesignParams, NoiseSource, PlanAdvice};
+    use raysweep_transport::plane::board::{BoardCalibration, CalibrationCovariance, Estimate};
+    use raysweep_transport::plane::{NoiseModel, PixelResponse, RESPONSE_ROWS};
 
     use super::*;
     use crate::plane::advice::{NoAdvice, advise, design};
@@ -105,6 +110,33 @@ mod tests {
         let read = ((9.0_f64 / 4150.0).powi(2) + 1.0 / 12.0 / 2500.0_f64.powi(2)).sqrt();
         assert!((advice.noise.dark - read).abs() < 1e-12);
         assert_eq!(advise(&other, &rig, &camera).unwrap().expected, better.expected);
+    }
+
+    #[test]
+    fn the_noise_that_a_calibration_measured_is_taken_for_true() {
+        let (rig, camera) = (RigFile::parse(RIG).unwrap(), camera());
+        let mut own = task(&rig, SMALL);
+        let stated = own.task.geometry.clone();
+        let exact = |value| Estimate { value, sd: 0.0 };
+        let mut shares = [0.0; RESPONSE_ROWS];
+        shares[RESPONSE_ROWS / 2] = 1.0;
+        let calibration = BoardCalibration {
+            row_starts_us: stated.timing().unwrap().row_starts_us().to_vec(),
+            camera_row_time_us: exact(22.22),
+            exposure_offset_us: exact(0.0),
+            jitter_us: 0.0,
+            covariance: CalibrationCovariance::independent([0.0; 5]),
+            response: PixelResponse::with_beam(Array2::from_shape_fn((720, 16), |(t, _)| t as f32), &shares)
+                .unwrap(),
+            white_dn: Array2::from_elem((720, 16), 2500.0),
+            noise: NoiseModel { read_variance: 0.04, gain: 0.09 },
+            strip: None,
+            lamp: None,
+        };
+        let task = Arc::make_mut(&mut own.task);
+        task.geometry = stated.calibrated(Arc::new(calibration));
+        let noise = advise(&own, &rig, &camera).unwrap().noise;
+        assert_eq!((noise.dark, noise.shot, noise.source), (0.2, 0.3, NoiseSource::Calibrated));
     }
 
     #[test]

@@ -37,6 +37,8 @@ pub struct RigFacts {
     pub trigger_margin_us: f64,
     /// How long a lost camera may stay away.
     pub reopen: Duration,
+    /// Frames per second without the trigger, if the camera is to run freely whatever the rig file says of its trigger.
+    pub free_hz: Option<f64>,
 }
 
 /// A camera that has neither answered nor delivered a frame for this long is lost.
@@ -363,7 +365,7 @@ impl AravisCamera {
 
     /// What is known about the triggers now.
     fn triggers(&self) -> Triggers {
-        let period_us = if self.config.is_triggered() {
+        let period_us = if self.facts.free_hz.is_none() && self.config.is_triggered() {
             self.facts.trigger_period_us
         } else {
             // The frames of a free-running camera may follow each other as fast as it can deliver them.

@@ -161,7 +161,7 @@ impl Owner {
             // A client that died may have left it streaming; a camera that is not streaming may refuse this.
             let _ = device.execute("AcquisitionStop");
         }
-        let set_up = set_up(&device, config, facts.format)?;
+        let set_up = set_up(&device, config, facts.format, facts.free_hz)?;
         let payload_bytes =
             device.camera.payload().map_err(|error| device_error("payload size", &error))? as usize;
         let socket = SocketBuffer::of(config, payload_bytes);

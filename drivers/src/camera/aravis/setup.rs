@@ -34,11 +34,16 @@ pub struct ChunksOn {
     pub sequencer_set: bool,
 }
 
-/// Sets a camera up according to the rig file.
+/// Sets a camera up according to the rig file; with `free_hz`, without its trigger and at this frame rate.
 ///
 /// # Errors
 /// A missing feature that sweeps require, or a value that the camera rejects.
-pub fn set_up(features: &impl Features, config: &AravisConfig, format: PixelFormat) -> Result<SetUp> {
+pub fn set_up(
+    features: &impl Features,
+    config: &AravisConfig,
+    format: PixelFormat,
+    free_hz: Option<f64>,
+) -> Result<SetUp> {
     let mut lacks = Vec::new();
     // While the sequencer runs, cameras accept no settings.
     sequencer::stop(features)?;
@@ -95,7 +100,7 @@ pub fn set_up(features: &impl Features, config: &AravisConfig, format: PixelForm
             "the exposure time as chunk data: the exposure that it was set to is taken for true".into(),
         );
     }
-    set_trigger(features, config)?;
+    set_trigger(features, config, names.exposure, free_hz)?;
     let readout_us = match first_present(features, &["SensorReadoutTime", "ReadoutTime"]) {
         Some(name) => features.float(name).ok(),
         None => None,
@@ -182,12 +187,15 @@ fn set_chunks(features: &impl Features) -> Result<ChunksOn> {
     Ok(on)
 }
 
+const RATE: &str = "AcquisitionFrameRate";
+const LIMITED: &str = "AcquisitionFrameRateEnable";
+/// More than any camera's rate: some state no limit.
+const FASTEST_HZ: f64 = 1e5;
+
 /// Sets the rate of a free-running camera. Without it, a camera may go as fast as it can, with short exposures alone.
-fn set_rate(features: &impl Features, config: &AravisConfig) -> Result<()> {
-    const RATE: &str = "AcquisitionFrameRate";
-    let Some(free_hz) = config.free_hz else { return Ok(()) };
-    if features.has("AcquisitionFrameRateEnable") {
-        put_boolean(features, "AcquisitionFrameRateEnable", true)?;
+fn limit_rate(features: &impl Features, free_hz: f64) -> Result<()> {
+    if features.has(LIMITED) {
+        put_boolean(features, LIMITED, true)?;
     }
     if features.has(RATE) {
         let range = features.float_range(RATE)?;
@@ -196,10 +204,32 @@ fn set_rate(features: &impl Features, config: &AravisConfig) -> Result<()> {
     Ok(())
 }
 
-fn set_trigger(features: &impl Features, config: &AravisConfig) -> Result<()> {
-    // A frame rate set in the camera would delay triggers.
-    if config.is_triggered() && features.has("AcquisitionFrameRateEnable") {
-        put_boolean(features, "AcquisitionFrameRateEnable", false)?;
+/// Ends the limit that a viewfinder, even one that was killed, has left in the camera: it would delay triggers.
+fn free_rate(features: &impl Features, exposure: &str) -> Result<()> {
+    if features.has(LIMITED) {
+        return put_boolean(features, LIMITED, false);
+    }
+    if features.has(RATE) {
+        // The rate that a camera allows may depend on its exposure, which may be a viewfinder's still.
+        features.set_float(exposure, *features.float_range(exposure)?.start())?;
+        let most_hz = features.float_range(RATE)?.end().min(FASTEST_HZ);
+        if let Err(error) = features.set_float(RATE, most_hz) {
+            // It shows a rate that nobody can set, a viewfinder neither.
+            tracing::debug!(%error, "the camera's frame rate is left as it is");
+        }
+    }
+    Ok(())
+}
+
+fn set_trigger(
+    features: &impl Features,
+    config: &AravisConfig,
+    exposure: &str,
+    free_hz: Option<f64>,
+) -> Result<()> {
+    let is_triggered = config.is_triggered() && free_hz.is_none();
+    if is_triggered {
+        free_rate(features, exposure)?;
     }
     if features.has("TriggerSelector") {
         for selector in features.choices("TriggerSelector")? {
@@ -207,8 +237,8 @@ fn set_trigger(features: &impl Features, config: &AravisConfig) -> Result<()> {
             put_text(features, "TriggerMode", "Off")?;
         }
     }
-    if !config.is_triggered() {
-        return set_rate(features, config);
+    if !is_triggered {
+        return free_hz.map_or(Ok(()), |free_hz| limit_rate(features, free_hz));
     }
     if features.has("TriggerSelector") {
         put_text(features, "TriggerSelector", "FrameStart")?;
@@ -271,7 +301,7 @@ mod tests {
     #[test]
     fn settings_are_written_in_the_order_that_cameras_need() {
         let camera = sfnc();
-        let set_up = set_up(&camera, &config(), PixelFormat::Mono12p).unwrap();
+        let set_up = set_up(&camera, &config(), PixelFormat::Mono12p, None).unwrap();
         assert_eq!((set_up.width, set_up.height), (640, 480));
         // There is no sequencer, so no set to report.
         assert_eq!(set_up.chunks, ChunksOn { exposure: true, sequencer_set: false });
@@ -307,7 +337,7 @@ mod tests {
     fn frames_tell_the_sequencers_set_where_they_can() {
         let chunks = |chunks: &[&'static str]| {
             let camera = sfnc().with_text("SequencerMode", &["Off", "On"]).with_text("ChunkSelector", chunks);
-            let on = set_up(&camera, &config(), PixelFormat::Mono8).unwrap().chunks;
+            let on = set_up(&camera, &config(), PixelFormat::Mono8, None).unwrap().chunks;
             (on.exposure, on.sequencer_set, camera.boolean("ChunkModeActive").unwrap())
         };
         assert_eq!(chunks(&["ExposureTime", "SequencerSetActive"]), (true, true, true));
@@ -320,20 +350,35 @@ mod tests {
     fn all_of_the_sensor_is_read_and_a_free_running_camera_waits_for_nothing() {
         let camera = sfnc();
         let config = AravisConfig { region: None, trigger_source: "off".into(), ..config() };
-        let set_up = set_up(&camera, &config, PixelFormat::Mono8).unwrap();
+        let set_up = set_up(&camera, &config, PixelFormat::Mono8, None).unwrap();
         assert_eq!((set_up.width, set_up.height), (1600, 1200));
         assert_eq!(camera.text("TriggerMode").unwrap(), "Off");
 
         let rated = sfnc()
             .with("AcquisitionFrameRateEnable", Value::Boolean(false))
             .with("AcquisitionFrameRate", Value::Float(160.0, 1.0..=160.0));
-        super::set_up(&rated, &self::config().free_running(15.0), PixelFormat::Mono8).unwrap();
+        super::set_up(&rated, &self::config(), PixelFormat::Mono8, Some(15.0)).unwrap();
         assert_eq!(rated.text("TriggerMode").unwrap(), "Off");
         let rate_hz = |camera: &Scripted| camera.float("AcquisitionFrameRate").unwrap();
         assert!(rated.boolean("AcquisitionFrameRateEnable").unwrap());
         assert_eq!(rate_hz(&rated), 15.0);
-        super::set_up(&rated, &self::config().free_running(0.1), PixelFormat::Mono8).unwrap();
+        super::set_up(&rated, &self::config(), PixelFormat::Mono8, Some(0.1)).unwrap();
         assert_eq!(rate_hz(&rated), 1.0, "the slowest that it can");
+    }
+
+    #[test]
+    fn the_rate_of_a_viewfinder_does_not_limit_the_triggered_run_after_it() {
+        let rated = || sfnc().with("AcquisitionFrameRate", Value::Float(160.0, 1.0..=160.0));
+        let switched = rated().with("AcquisitionFrameRateEnable", Value::Boolean(false));
+        for camera in [&rated(), &switched] {
+            for free_hz in [Some(15.0), None] {
+                set_up(camera, &config(), PixelFormat::Mono8, free_hz).unwrap();
+            }
+            let is_limited = camera.boolean("AcquisitionFrameRateEnable").unwrap_or(true);
+            let rate_hz = camera.float("AcquisitionFrameRate").unwrap();
+            assert!(!is_limited || rate_hz == 160.0, "{rate_hz} Hz");
+            assert_eq!(camera.text("TriggerMode").unwrap(), "On");
+        }
     }
 
     #[test]
@@ -346,7 +391,7 @@ mod tests {
             .with_text("TriggerMode", &["Off", "On"])
             .with_text("TriggerSource", &["Line0", "Software"]);
         let config = AravisConfig { features: vec![], region: None, black_level: None, ..config() };
-        let set_up_poor = set_up(&poor, &config, PixelFormat::Mono8).unwrap();
+        let set_up_poor = set_up(&poor, &config, PixelFormat::Mono8, None).unwrap();
         assert_eq!(set_up_poor.names.exposure, "ExposureTimeAbs");
         let lacks = set_up_poor.lacks.join("; ");
         for what in ["trigger delay", "shutter mode", "chunk data"] {
@@ -354,7 +399,7 @@ mod tests {
         }
 
         let refused = |camera: Scripted, config: &AravisConfig, format| {
-            set_up(&camera, config, format).unwrap_err().to_string()
+            set_up(&camera, config, format, None).unwrap_err().to_string()
         };
         let without_exposure = Scripted::default()
             .with_text("PixelFormat", &["Mono8"])

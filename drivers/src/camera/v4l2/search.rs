@@ -17,11 +17,12 @@ use super::controls::Controls;
 use super::fourcc;
 use super::kernel::Kernel;
 use crate::camera::CameraFacts;
+use crate::search::permanent;
 
 /// A camera node.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FoundNode {
-    /// Its path.
+    /// The path that stays with the camera, if it has one.
     pub path: PathBuf,
     /// What it offers. Its own controls may delay the trigger; their names do not tell.
     pub facts: CameraFacts,
@@ -76,7 +77,8 @@ fn facts(path: &Path) -> Option<FoundNode> {
         formats,
         ..CameraFacts::default()
     };
-    (!facts.formats.is_empty()).then(|| FoundNode { path: path.to_owned(), facts })
+    let path = permanent(Path::new("/dev/v4l/by-id"), path.to_owned());
+    (!facts.formats.is_empty()).then_some(FoundNode { path, facts })
 }
 
 fn rate_hz(time: &Fraction) -> f64 {

@@ -26,6 +26,8 @@ pub struct BoardCalibration {
     /// Counts above black that a pixel collects in one pass of a white picture, `[t, s]`; NaN where the board was not
     /// lit.
     pub white_dn: Array2<f32>,
+    /// Noise of one frame, in shares of white.
+    pub noise: NoiseModel,
     /// Where the board stays in view during runs, if it does.
     pub strip: Option<BoardStrip>,
     /// A lamp that flickered in the room; `None` if none did, or it was not measured.
@@ -37,8 +39,6 @@ pub struct BoardCalibration {
 pub struct BoardStrip {
     /// The columns.
     pub columns: Range<usize>,
-    /// Noise of one frame, in shares of white.
-    pub noise: NoiseModel,
     /// Standard deviation of the lateness of a frame's light, before it is measured.
     pub jitter_us: f64,
 }

@@ -15,6 +15,8 @@ use super::settings::{BoardFrame, BoardSetting, ExposureMode};
 #[derive(Debug, Clone)]
 pub struct JitterGauge {
     strip: BoardStrip,
+    /// Noise of one frame, in shares of white.
+    noise: NoiseModel,
     seen: Columns,
     sweep: Sweep,
     camera_row_us: f64,
@@ -59,6 +61,7 @@ impl JitterGauge {
         let response = calibration.response.shares();
         Ok(Self {
             strip: strip.clone(),
+            noise: calibration.noise,
             seen: Columns::new(places.view(), response.slice(s![.., .., start..end]))?,
             sweep: Sweep::new(calibration.row_starts_us.clone(), period_us),
             camera_row_us: calibration.camera_row_time_us.value,
@@ -77,7 +80,7 @@ impl JitterGauge {
     /// Those of [`Columns::average`].
     pub fn lateness(&self, setting: &Setting, light: ArrayView2<f32>) -> Result<Lateness, PlaneError> {
         let frames = setting.delays_us.len().max(1) as f64;
-        let NoiseModel { read_variance, gain } = self.strip.noise;
+        let NoiseModel { read_variance, gain } = self.noise;
         let clocks =
             Clocks { camera_row_us: self.camera_row_us, mode_offset_us: 0.0, exposure_offset_us: 0.0 };
         let comparison = FrameComparison {
