@@ -591,7 +591,7 @@ impl Control for Runner {
     }
 
     fn viewfinder(&self, wanted: &ViewfinderParams) -> Result<(), RpcError> {
-        check_look(wanted, &self.camera)?;
+        check_look(wanted, &self.camera, matches!(self.rig, SharedRig::Dots(_)))?;
         let none = || {
             let what = "no viewfinder is running: `raysweep viewfinder` starts one";
             RpcError::new(ErrorCode::NotRunning, what)

@@ -338,6 +338,12 @@ fn the_dot_of_a_dot_rig_has_its_place_size_and_peak() {
     view.show(FinderPicture::Black);
     let dark = view.picture(|values| values.picture == FinderPicture::Black);
     assert_eq!(dark.dot, None);
+    let align = ViewfinderParams { picture: Some(FinderPicture::Align), ..ViewfinderParams::default() };
+    let refused = view.runner.viewfinder(&align).unwrap_err();
+    assert!(
+        refused.name() == Some(ErrorCode::InvalidParams) && refused.message.contains("no rows"),
+        "{refused:?}"
+    );
     view.runner.cancel().unwrap();
     assert_eq!(view.end(), ("complete".into(), None));
     let mut tilted = View::new(rig, "tilt_deg = [1.0, 0.0]\n");

@@ -2,6 +2,7 @@
 
 use std::fs::File;
 use std::io::{self, Read};
+use std::os::unix::fs::FileTypeExt;
 use std::path::Path;
 
 use raysweep_session::input;
@@ -12,9 +13,15 @@ use super::failure::CommandFailure;
 pub(super) fn read_plan(path: &Path) -> Result<String, CommandFailure> {
     let read = || {
         let file = File::open(path)?;
-        match file.metadata()?.is_file() {
-            true => input::read_text(path, MOST_BYTES),
-            false => io::read_to_string(file.take(MOST_BYTES)),
+        if !file.metadata()?.file_type().is_fifo() {
+            return input::read_text(path, MOST_BYTES);
+        }
+        let text = io::read_to_string(file.take(MOST_BYTES + 1))?;
+        match text.len() as u64 > MOST_BYTES {
+            true => {
+                Err(io::Error::new(io::ErrorKind::InvalidInput, format!("longer than {MOST_BYTES} bytes")))
+            }
+            false => Ok(text),
         }
     };
     read().map_err(|source| CommandFailure::File { path: path.to_owned(), source })

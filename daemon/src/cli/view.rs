@@ -193,13 +193,13 @@ impl EventView {
                 let parts = progress.under_way.map_or(0.0, PointUnderWay::share) * PARTS;
                 bar.set_length(progress.points_planned as u64 * PARTS as u64);
                 bar.set_position(progress.points_stored as u64 * PARTS as u64 + parts as u64);
-                // Unlike in what is said of the points at the run's end.
-                bar.set_message(format!("{stored} with darks  {pace}"));
+                // Not only points, of which the run's end speaks: dark and regular images too, cycles, batches.
+                bar.set_message(format!("{stored} measurements  {pace}"));
                 details.set_message(all);
             }
             Place::Lines { told } if told.is_none_or(|told| told.elapsed() >= PACE) => {
                 *told = Some(Instant::now());
-                eprintln!("{stored} stored, with dark images  {pace}  {all}");
+                eprintln!("{stored} measurements stored  {pace}  {all}");
             }
             Place::Lines { .. } | Place::Quiet | Place::Json => {}
         }

@@ -2,7 +2,7 @@
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use raysweep_core::CameraCapabilities;
+use raysweep_core::{CameraCapabilities, FinderPicture};
 use raysweep_proto::{ErrorCode, RpcError, ViewfinderParams};
 
 /// Changes wanted of a run's viewfinder and not yet made. Closed, unless the run is one.
@@ -48,12 +48,21 @@ impl WantedLook {
     }
 }
 
-/// Checks whether the camera can show what is wanted.
+/// Checks whether the rig can show what is wanted.
 ///
 /// # Errors
 /// `InvalidParams`, with the field.
-pub fn check_look(wanted: &ViewfinderParams, camera: &CameraCapabilities) -> Result<(), RpcError> {
+pub fn check_look(
+    wanted: &ViewfinderParams,
+    camera: &CameraCapabilities,
+    is_dot_rig: bool,
+) -> Result<(), RpcError> {
     let invalid = |field, what: String| Err(RpcError::new(ErrorCode::InvalidParams, what).of_field(field));
+    if is_dot_rig && wanted.picture == Some(FinderPicture::Align) {
+        let what =
+            "picture = \"align\": a dot rig has no rows to align; allowed: white, black, grid, rows, cross";
+        return invalid("picture", what.into());
+    }
     let (rows, columns) = (camera.height, camera.width);
     if let Some(region @ [top, bottom, left, right]) = wanted.region
         && !(top < bottom && bottom <= rows && left < right && right <= columns)
@@ -75,8 +84,6 @@ pub fn check_look(wanted: &ViewfinderParams, camera: &CameraCapabilities) -> Res
 
 #[cfg(test)]
 mod tests {
-    use raysweep_core::FinderPicture;
-
     use super::*;
 
     #[test]
