@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use aravis::{Buffer, BufferStatus};
 use raysweep_core::{
     Applied, Camera, CameraCapabilities, CameraSettings, Clock, ClockModel, DeviceError, DeviceErrorKind,
-    DeviceState, FirstFrame, FrameBuf, FrameStamp, LossCause, PixelFormat, RoundTrip, SettingsId, ns_from_us,
+    DeviceState, FirstFrame, FrameBuf, FrameStamp, LossCause, PixelFormat, SettingsId, ns_from_us,
     us_from_ns,
 };
 
@@ -21,6 +21,7 @@ use super::losses::Losses;
 use super::owner::{Done, OpenedCamera, Owner, OwnerCommand, OwnerOrder, OwnerReply, Shared};
 use super::promise::{Latency, Promises, Triggers, first_frame};
 use super::sequencer::SequencerSets;
+use crate::arrival_clock::ArrivalClock;
 use crate::reopen::Reopening;
 use raysweep_config::rig::aravis::{AravisConfig, TimestampAt};
 
@@ -83,7 +84,8 @@ enum Link {
     Up {
         frames: Frames,
         chunks: Option<Chunks>,
-        tells_time: bool,
+        /// The clock of a camera that cannot be asked for its time.
+        arrivals: Option<ArrivalClock>,
     },
     Lost,
     /// The owner thread is opening the lost camera.
@@ -165,7 +167,7 @@ impl AravisCamera {
                 Ok(OwnerReply::Done(..)) | Err(_) => return Err(thread_ended()),
             }
         };
-        let OpenedCamera { frames, chunks, capabilities, tells_time, .. } = opened;
+        let OpenedCamera { frames, chunks, capabilities, arrivals, .. } = opened;
         let mut ids = FrameIds::default();
         ids.restart(1);
         Ok(Self {
@@ -178,7 +180,7 @@ impl AravisCamera {
             replies,
             owner: Some(thread),
             ticket: 0,
-            link: Link::Up { frames, chunks, tells_time },
+            link: Link::Up { frames, chunks, arrivals },
             armed_ns: None,
             ids,
             losses: Losses::new(),
@@ -284,8 +286,8 @@ impl AravisCamera {
 
     /// Goes on with a camera that was opened again, if it is the same as before.
     fn resume(&mut self, opened: OpenedCamera) -> Result<(), DeviceError> {
-        let OpenedCamera { frames, chunks, capabilities: found, tells_time, armed_ns } = opened;
-        self.link = Link::Up { frames, chunks, tells_time };
+        let OpenedCamera { frames, chunks, capabilities: found, arrivals, armed_ns } = opened;
+        self.link = Link::Up { frames, chunks, arrivals };
         if found != self.capabilities {
             return self.lose(&format!(
                 "there is now {} of {} x {} pixels, with other abilities than {}: connect the camera again that the run began with",
@@ -317,7 +319,7 @@ impl AravisCamera {
             );
             return Err(error(DeviceErrorKind::Protocol, what));
         }
-        let Link::Up { chunks, tells_time, .. } = &mut self.link else { return Ok(None) };
+        let Link::Up { chunks, arrivals, .. } = &mut self.link else { return Ok(None) };
         let Said { exposure_us, sequencer_set } =
             chunks.as_mut().map(|chunks| chunks.read(from, bytes)).unwrap_or_default();
         let set = sequencer_set.zip(self.first_set);
@@ -330,12 +332,14 @@ impl AravisCamera {
             TimestampAt::ExposureEnd => stamped_ns - ns_from_us(set_us),
         };
         let arrived_ns = host_ns - ns_from_us(set_us + self.capabilities.readout_us);
-        let exposure_start_ns = self.shared.with_model(|model| {
-            if !*tells_time {
-                model.add(RoundTrip { request_ns: arrived_ns, device_ns, receive_ns: arrived_ns });
+        let exposure_start_ns = match arrivals {
+            Some(clock) => {
+                clock.arrived(device_ns, arrived_ns);
+                clock.host_ns_so_far(device_ns)
             }
-            model.host_ns(device_ns).unwrap_or(arrived_ns)
-        });
+            None => self.shared.with_model(|model| model.host_ns(device_ns)),
+        };
+        let exposure_start_ns = exposure_start_ns.unwrap_or(arrived_ns);
         let Some(seq) = self.ids.extend(from.frame_id()) else { return Ok(None) };
         self.losses.whole(seq);
         self.reopening.delivered();

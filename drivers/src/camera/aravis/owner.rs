@@ -18,6 +18,7 @@ use super::network::{self, SocketBuffer};
 use super::sequencer::{self, SequencerSets};
 use super::settings::FeatureWriter;
 use super::setup::set_up;
+use crate::arrival_clock::ArrivalClock;
 use raysweep_config::rig::aravis::AravisConfig;
 
 /// Interval of reading the clock of a camera that delivers no frames, which also checks that it is there.
@@ -80,7 +81,8 @@ pub struct OpenedCamera {
     pub chunks: Option<Chunks>,
     pub capabilities: CameraCapabilities,
     /// Whether its clock can be read.
-    pub tells_time: bool,
+    /// Its clock, if it cannot be asked for its time.
+    pub arrivals: Option<ArrivalClock>,
     /// Since when it answers triggers, if it does.
     pub armed_ns: Option<i64>,
 }
@@ -219,7 +221,8 @@ impl Owner {
         if self.armed {
             device.execute("AcquisitionStart")?;
         }
-        let opened = OpenedCamera { frames, chunks, capabilities, tells_time: clock.is_some(), armed_ns };
+        let arrivals = clock.is_none().then(|| ArrivalClock::new(0));
+        let opened = OpenedCamera { frames, chunks, capabilities, arrivals, armed_ns };
         Ok((Connection { device, writer, clock }, opened))
     }
 

@@ -4,7 +4,6 @@
 //!
 //! If the host does not keep up, the analyser stops: samples are never lost within a running stream.
 
-mod clock;
 pub mod protocol;
 pub mod scan;
 mod usb;
@@ -15,10 +14,10 @@ use std::time::{Duration, Instant};
 pub use raysweep_config::rig::vsync::{Fx2LafwConfig, Slope};
 use raysweep_core::{ClockQuality, DeviceError, DeviceErrorKind, Edge, Vsync, ns_from_us};
 
-use self::clock::SampleClock;
 use self::protocol::SampleRate;
 use self::scan::Scanner;
 use super::DEVICE;
+use crate::arrival_clock::ArrivalClock;
 pub use usb::{Usb, has_firmware};
 
 /// Without a sample for so long the analyser has stopped.
@@ -64,7 +63,7 @@ pub struct Fx2Lafw<L> {
 struct Signals {
     rate: SampleRate,
     scanner: Scanner,
-    clock: SampleClock,
+    clock: ArrivalClock,
     quiet_ns: i64,
     channels: Vec<Channel>,
     changes: VecDeque<Change>,
@@ -119,7 +118,7 @@ impl<L: AnalyserLink> Fx2Lafw<L> {
             signals: Signals {
                 rate,
                 scanner: Scanner::new(channels.iter().fold(0, |mask, channel| mask | channel.bit)),
-                clock: SampleClock::new(ns_from_us(config.latency_us)),
+                clock: ArrivalClock::new(ns_from_us(config.latency_us)),
                 quiet_ns,
                 channels,
                 changes: VecDeque::with_capacity(QUEUE),
