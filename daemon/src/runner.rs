@@ -72,6 +72,7 @@ pub struct Runner {
 struct Start<'a> {
     orders: &'a Arc<Orders>,
     is_resumed: bool,
+    is_attached: bool,
 }
 
 /// The run in progress, or the last one.
@@ -84,6 +85,8 @@ struct Current {
 /// A run that has begun.
 struct Begun {
     session: PathBuf,
+    /// Whether it ends with the client that began it; never if it was resumed.
+    is_attached: bool,
     thread: JoinHandle<()>,
 }
 
@@ -282,7 +285,7 @@ impl Runner {
         ledger: Ledger,
         start: Start<'_>,
     ) -> Result<Begun, RpcError> {
-        let Start { orders, is_resumed } = start;
+        let Start { orders, is_resumed, is_attached } = start;
         let dir = session.dir().to_owned();
         self.board.set_session(dir.clone());
         let run = Run {
@@ -302,7 +305,7 @@ impl Runner {
             .map_err(|error| {
                 RpcError::new(ErrorCode::Internal, format!("cannot start the run's thread: {error}"))
             })?;
-        Ok(Begun { session: dir, thread })
+        Ok(Begun { session: dir, is_attached, thread })
     }
 
     fn outlet(&self, dir: &Path) -> Option<Outlet> {
@@ -364,7 +367,13 @@ impl Runner {
         let (session, ledger) =
             Session::create_with(&self.data, entry, texts, keep).map_err(|NotBegun(error)| error)?;
         let dir = session.dir().to_owned();
-        self.spawn(foreseen, session, ledger, Start { orders, is_resumed: false }).inspect_err(|_| {
+        self.spawn(
+            foreseen,
+            session,
+            ledger,
+            Start { orders, is_resumed: false, is_attached: params.attached },
+        )
+        .inspect_err(|_| {
             // Nothing was acquired, so there is nothing to resume.
             let _ = std::fs::remove_dir_all(&dir);
         })
@@ -439,7 +448,7 @@ impl Runner {
         let stored_bytes = session.stored_bytes().map_err(|error| storage(&error))?;
         self.check_needs(&foreseen.report, foreseen.instead, stored_bytes)?;
         self.go_on_preparing(orders)?;
-        self.spawn(foreseen, session, ledger, Start { orders, is_resumed: true })
+        self.spawn(foreseen, session, ledger, Start { orders, is_resumed: true, is_attached: false })
     }
 }
 
@@ -514,7 +523,9 @@ impl Control for Runner {
 
     fn abandon(&self, session: &Path) {
         let current = self.lock();
-        let is_it = |current: &&Current| current.begun.as_ref().is_some_and(|begun| begun.session == session);
+        let is_it = |current: &&Current| {
+            current.begun.as_ref().is_some_and(|begun| begun.is_attached && begun.session == session)
+        };
         if let Some(current) = current.as_ref().filter(is_it) {
             // Nothing happens if the run is over.
             current.orders.give(Order::Cancel);

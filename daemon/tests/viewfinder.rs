@@ -15,7 +15,9 @@ use raysweep::live::{LiveFile, LiveReader, VIEWFINDER};
 use raysweep::rig::{AnyRig, Devices, Rig};
 use raysweep_core::{DeviceError, FinderPicture, Pattern, Projector, Shown};
 use raysweep_processing::process as process_session;
-use raysweep_proto::{Client, ErrorCode, Event, RunParams, RunState, ViewfinderParams, ViewfinderValues};
+use raysweep_proto::{
+    Client, ErrorCode, Event, ResumeParams, RunParams, RunState, ViewfinderParams, ViewfinderValues,
+};
 use raysweep_session::Session;
 use raysweep_sim::{LensControl, LensOf, PlaneTruth};
 use tempfile::TempDir;
@@ -480,16 +482,35 @@ fn a_viewfinder_ends_with_its_client_however_that_ends() {
     }
 }
 
+/// Somebody else may go on with a session that was begun by a client that is still there.
+#[test]
+fn a_resumed_run_does_not_end_with_the_client_that_began_the_session() {
+    let mut view = View::new(PLANE, "");
+    view.runner.cancel().unwrap();
+    view.end();
+    let plan = "kind = \"sweep\"\n[sweep]\ndelay_us = [-200, -100, 0, 100, 200]\nexposure_us = [400]\naverage = 100\n";
+    let params = RunParams { plan: plan.into(), attached: true, ..RunParams::default() };
+    let session = view.runner.run(params).unwrap().session;
+    view.runner.abandon(&session);
+    assert_eq!(view.end().0, "cancelled");
+    view.runner.resume(ResumeParams { session: session.clone() }).unwrap();
+    view.runner.abandon(&session);
+    assert_eq!(view.end().0, "complete");
+}
+
 #[test]
 fn a_viewfinder_ends_when_its_client_is_killed_unless_it_was_detached() {
     let program = Program::start(PLANE);
     let mut client = Client::connect(program.folder.path().join("socket")).unwrap();
-    let mut command = program.command(&["viewfinder"]);
-    let mut viewfinder = process::Process::start(command.stdout(Stdio::null()).stderr(Stdio::null()));
-    process::wait_for("a picture", || client.status().unwrap().viewfinder);
-    viewfinder.signal(Signal::SIGKILL);
-    viewfinder.wait();
-    process::wait_for("its end", || (client.status().unwrap().state == RunState::Idle).then_some(()));
+    program.plan("kind = \"viewfinder\"\n");
+    for words in [["viewfinder"].as_slice(), &["run", "plan.toml"]] {
+        let mut command = program.command(words);
+        let mut viewfinder = process::Process::start(command.stdout(Stdio::null()).stderr(Stdio::null()));
+        process::wait_for("a picture", || client.status().unwrap().viewfinder);
+        viewfinder.signal(Signal::SIGKILL);
+        viewfinder.wait();
+        process::wait_for("its end", || (client.status().unwrap().state == RunState::Idle).then_some(()));
+    }
     assert!(program.raysweep(&["viewfinder", "--detach"]).status.success());
     // Its second picture comes long after its client has gone.
     let pictures = |client: &mut Client| client.status().unwrap().viewfinder.map_or(0, |seen| seen.pictures);

@@ -447,7 +447,9 @@ pub fn list(root: &Path) -> Result<Listing> {
         .map_err(Error::io("list", root))?;
     dirs.sort();
     let mut listing = Listing::default();
-    for dir in dirs {
+    // A copy that is being made, or was cut off, is no session yet.
+    let is_draft = |dir: &PathBuf| dir.to_string_lossy().ends_with(durable::TEMPORARY_SUFFIX);
+    for dir in dirs.into_iter().filter(|dir| !is_draft(dir)) {
         let Ok(session) = Session::open(&dir) else { continue };
         match session.state() {
             Ok(state) => listing.sessions.push(SessionSummary {

@@ -75,7 +75,7 @@ pub(super) enum CommandFailure {
 
 /// A problem that the daemon found in a plan, with the plan's text.
 #[derive(Debug, thiserror::Error, Diagnostic)]
-#[error("{error}")]
+#[error("{}", printable(&error.message))]
 pub(super) struct PlanProblem {
     error: RpcError,
     #[source_code]
@@ -101,9 +101,13 @@ impl CommandFailure {
                     let (start, end) = span?;
                     let start = start.min(text.len());
                     let label = field.unwrap_or_else(|| "here".into());
-                    Some(LabeledSpan::new_with_span(Some(label), start..end.clamp(start, text.len())))
+                    Some(LabeledSpan::new_with_span(
+                        Some(printable(&label).into_owned()),
+                        start..end.clamp(start, text.len()),
+                    ))
                 });
-                let (labels, help) = (labels.collect(), data.and_then(|data| data.help));
+                let help = data.and_then(|data| data.help).map(|help| printable(&help).into_owned());
+                let labels = labels.collect();
                 let plan = NamedSource::new(printable(&path.display().to_string()), shown(text));
                 Self::Plan(Box::new(PlanProblem { error, plan, labels, help }))
             }
@@ -182,8 +186,12 @@ impl CommandFailure {
 
 /// A plan's text as it may be shown, with every character at its place: labels count bytes.
 fn shown(plan: &str) -> String {
-    let shown =
-        |letter: char| if is_unprintable(letter) { "?".repeat(letter.len_utf8()) } else { letter.into() };
+    let shown = |letter: char| match letter {
+        // Of a line's end.
+        '\r' => " ".into(),
+        letter if is_unprintable(letter) => "?".repeat(letter.len_utf8()),
+        letter => letter.into(),
+    };
     plan.chars().map(shown).collect()
 }
 

@@ -32,6 +32,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Parser;
+use raysweep_config::{Plan, Procedure};
 use raysweep_drivers::mirror::{self, Parked};
 use raysweep_proto::{Client, DesignParams, Empty, RunParams, Started};
 use serde_json::json;
@@ -101,25 +102,18 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             printer.print(&report, show::design)?;
         }
         Command::Run(RunArguments { plan, about }) => {
-            return run(&socket, printer, &plan, &read_plan(&plan)?, about, WithoutClient::GoesOn);
+            return run(&socket, printer, &plan, &read_plan(&plan)?, about);
         }
         Command::Calibrate { plan: Some(plan), about } => {
-            return run(&socket, printer, &plan, &read_plan(&plan)?, about, WithoutClient::GoesOn);
+            return run(&socket, printer, &plan, &read_plan(&plan)?, about);
         }
         Command::Calibrate { plan: None, about } => {
-            return run(
-                &socket,
-                printer,
-                Path::new("calibrate"),
-                calibration::PLAN,
-                about,
-                WithoutClient::GoesOn,
-            );
+            return run(&socket, printer, Path::new("calibrate"), calibration::PLAN, about);
         }
         Command::Expose { plan } => return expose::expose(&socket, &plan, printer),
         Command::Viewfinder(arguments) => match change_or_plan(&socket, &arguments)? {
             Wanted::Plan(path, text) => {
-                return run(&socket, printer, &path, &text, arguments.about, WithoutClient::Ends);
+                return run(&socket, printer, &path, &text, arguments.about);
             }
             Wanted::Changed => return changed(printer),
         },
@@ -276,19 +270,20 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             let session = folder_of(session, &socket);
             let to = to.unwrap_or_else(|| export_path(&session, format));
             let scope = if stack { ExportScope::ResultsAndArrays } else { ExportScope::Results };
-            let state =
-                Session::open(&session).and_then(|session| session.state()).map_err(ProcessError::from)?;
-            let (stored, points) = (state.stored_points(), state.session.shape.points());
             let files = match format {
                 Some(format) => export_as(&session, &to, accept_damage, scope, format)?,
                 None => export(&session, &to, accept_damage, scope)?,
             };
-            let value = json!({ "folder": to, "files": files, "is_over": state.end.is_some(), "stored": stored, "points": points });
+            // A damaged ledger is exported too, if that is accepted.
+            let state = Session::open(&session).and_then(|session| session.state()).ok();
+            let unended = state.filter(|state| state.end.is_none());
+            let unended = unended.map(|state| (state.stored_points(), state.session.shape.points()));
+            let value = json!({ "folder": to, "files": files, "is_over": unended.is_none() });
             printer.print(&value, |_| {
                 let copied = format!("{files} files copied to {}", to.display());
-                match state.end {
-                    Some(_) => copied,
-                    None => format!(
+                match unended {
+                    None => copied,
+                    Some((stored, points)) => format!(
                         "{copied}\nthe session's run has not ended: it is still being acquired, or was cut off; {stored} of {points} points were stored"
                     ),
                 }
@@ -308,13 +303,14 @@ fn verify(session: &Path, printer: Printer) -> Result<Exit, CommandFailure> {
     Ok(if audit.damage.is_empty() { Exit::Done } else { Exit::Failed })
 }
 
-/// What becomes of a run when its client ends.
-#[derive(PartialEq)]
-enum WithoutClient {
-    /// It is left to the daemon.
-    GoesOn,
-    /// It is cancelled: it is of no use without its client, and would leave the light on.
-    Ends,
+/// Whether a run of this plan ends with its client: it is of no use without it, and would leave the light on.
+fn ends_with_client(plan: &str) -> bool {
+    Plan::parse(plan).is_ok_and(|plan| matches!(plan.procedure, Procedure::Viewfinder(_)))
+}
+
+/// How a run that is followed is left.
+fn interrupts_of(params: &RunParams) -> fn() -> io::Result<Interrupts> {
+    if params.attached { Interrupts::of_any_end } else { Interrupts::of_operator }
 }
 
 /// Runs a plan, given by its path and its text.
@@ -324,22 +320,21 @@ fn run(
     path: &Path,
     text: &str,
     about: RunDescription,
-    without_client: WithoutClient,
 ) -> Result<Exit, CommandFailure> {
     let RunDescription { detach, operator, sample, note, tags } = about;
-    let attached = !detach && without_client == WithoutClient::Ends;
+    let attached = !detach && ends_with_client(text);
     let params = RunParams { plan: text.to_owned(), operator, sample, note, tags, attached };
-    let interrupts = if attached { Interrupts::of_any_end } else { Interrupts::of_operator };
-    begin_run(socket, printer, detach, interrupts, |client| {
+    begin_run(socket, printer, detach, interrupts_of(&params), |client| {
         client.run(&params).map_err(|error| CommandFailure::of_plan(error, path, text))
     })
 }
 
 /// Runs the plan of a session again, and says what has changed since.
 fn rerun(socket: &Path, printer: Printer, session: &Path, detach: bool) -> Result<Exit, CommandFailure> {
-    let params = sessions::run_again(session)?;
+    let mut params = sessions::run_again(session)?;
+    params.attached = !detach && ends_with_client(&params.plan);
     let plan = session.join("plan.toml");
-    begin_run(socket, printer, detach, Interrupts::of_operator, |client| {
+    begin_run(socket, printer, detach, interrupts_of(&params), |client| {
         let started =
             client.run(&params).map_err(|error| CommandFailure::of_plan(error, &plan, &params.plan))?;
         let said = match sessions::changes(session, &started.session) {

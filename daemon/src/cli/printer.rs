@@ -30,7 +30,7 @@ impl Printer {
 }
 
 /// A text as it may be shown on a terminal. What others wrote into a session, a file or a device could otherwise move the
-/// cursor, or turn the direction of writing: such characters are shown as escapes, `\\u{1b}`.
+/// cursor, or turn the direction of writing: such characters are shown as escapes, `\u{1b}`.
 pub(super) fn printable(text: &str) -> Cow<'_, str> {
     match text.contains(is_unprintable) {
         true => Cow::Owned(text.chars().fold(String::with_capacity(text.len()), |mut shown, letter| {

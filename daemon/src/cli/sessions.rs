@@ -160,7 +160,11 @@ impl SessionView {
             points,
             counts: state.counts,
             light_s: end.and_then(|end| end.light_s),
-            settings: flat(&session, "plan.toml")?,
+            // A damaged plan may be none any more.
+            settings: match flat(&session, "plan.toml") {
+                Err(_) if !damage.is_empty() => BTreeMap::new(),
+                settings => settings?,
+            },
             damage,
             calibration: calibration_of(dir),
             findings: findings_of(&session),

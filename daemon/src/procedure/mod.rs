@@ -105,6 +105,10 @@ pub fn foresee_rest(
         (SharedRig::Plane(rig), Procedure::Calibration(own)) => {
             calibration::foresee(lab, RigOfRun::of_begun(rig, begun), &plan, own)
         }
-        _ => Err(of_another_rig(&plan, "no session of it can be resumed on this rig")),
+        (SharedRig::Dots(_), _)
+        | (
+            SharedRig::Plane(_),
+            Procedure::Film(_) | Procedure::Batches(_) | Procedure::Response(_) | Procedure::Viewfinder(_),
+        ) => Err(of_another_rig(&plan, "no session of it can be resumed on this rig")),
     }
 }

@@ -99,7 +99,10 @@ impl StatusBoard {
             let _ = self.events.send(Event::State { state: RunState::Paused, session });
         }
         if status.state == RunState::Paused {
-            status.question = Some(question.clone());
+            // What wants an answer is not forgotten for what needs none.
+            if question.wants_answer || !status.question.as_ref().is_some_and(|asked| asked.wants_answer) {
+                status.question = Some(question.clone());
+            }
             let _ = self.events.send(Event::Ask(question));
         }
         status.state == RunState::Paused

@@ -76,7 +76,7 @@ impl Access {
             format!("`{name}` is reserved for operators, and the user with id {} is an observer", peer.uid);
         let help = match &self.operators {
             Some(group) if group != "root" => format!("join the group `{group}` (`usermod -aG {group} USER` as root)"),
-            _ => "call it as root or as the daemon's own user; `raysweepd --group NAME` names a group of operators".into(),
+            _ => "call it as root or as the daemon's own user; `raysweepd --operators GROUP` names a group of operators".into(),
         };
         RpcError::new(ErrorCode::Forbidden, format!("{message}: {help}")).with_help(help)
     }
@@ -139,6 +139,6 @@ mod tests {
         assert_eq!(error.name(), Some(ErrorCode::Forbidden));
         assert!(error.data.is_some_and(|data| data.help.is_some_and(|help| help.contains("raysweep"))));
         let error = access(Some("root")).forbidden(Method::Run, STRANGER);
-        assert!(!error.message.contains("usermod") && error.message.contains("--group"), "{error}");
+        assert!(!error.message.contains("usermod") && error.message.contains("--operators GROUP"), "{error}");
     }
 }

@@ -185,7 +185,9 @@ fn read(path: &Path) -> Result<Option<(MirrorState, Sent)>, StateError> {
         .map_err(|source| StateError::Damaged { path: path.to_owned(), source })?;
     let sent_path = beside(path, "sent");
     let sent = read_regular(&sent_path).map_err(StateError::io("read", &sent_path))?;
-    let sent = String::from_utf8_lossy(&sent);
+    let sent = String::from_utf8(sent).map_err(|error| {
+        StateError::io("read", &sent_path)(io::Error::new(io::ErrorKind::InvalidData, error))
+    })?;
     let mut numbers = sent.split_whitespace().map(|number| number.parse().unwrap_or(0));
     let mut next = || numbers.next().unwrap_or(0);
     Ok(Some((state, Sent { certainly: next(), possibly: next() })))

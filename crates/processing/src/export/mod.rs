@@ -156,8 +156,13 @@ type Put<'a> = &'a dyn Fn(&Session, &Path, &Path) -> Result<(), ProcessError>;
 
 fn copy(session: &Session, from: &Path, to: &Path) -> Result<(), ProcessError> {
     let mut source = session.open_file(from, u64::MAX)?;
-    let copied = File::create(to).and_then(|mut target| std::io::copy(&mut source, &mut target));
-    copied.map(drop).map_err(not_copied(to))
+    let mut copied = || {
+        let mut target = File::create(to)?;
+        std::io::copy(&mut source, &mut target)?;
+        target.set_permissions(source.metadata()?.permissions())?;
+        target.sync_all()
+    };
+    copied().map_err(not_copied(to))
 }
 
 /// Links a file, or copies it to another file system.

@@ -52,7 +52,8 @@ fn is_equal(one: &[u8], other: &[u8]) -> bool {
 /// Lets a request through, or refuses it.
 pub(super) async fn admit(State(guard): State<Arc<Guard>>, request: Request, next: Next) -> Response {
     let mut answer = match guard.refusal(request.uri().path(), request.headers()) {
-        Some(why) => (StatusCode::FORBIDDEN, why).into_response(),
+        // Whoever is refused does not keep a connection, of which there are few.
+        Some(why) => (StatusCode::FORBIDDEN, [(header::CONNECTION, "close")], why).into_response(),
         None => next.run(request).await,
     };
     let headers = answer.headers_mut();

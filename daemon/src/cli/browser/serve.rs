@@ -1,4 +1,5 @@
-//! Connections of browsers. Everybody on this machine can connect, so that they are few, and none waits for long.
+//! Connections of browsers. Everybody on this machine can connect, so that they are few, none waits for long for a request,
+//! and the guard ends those that it refuses.
 
 use std::sync::Arc;
 use std::time::Duration;

@@ -8,6 +8,7 @@ use super::found::ConnectedDevices;
 use super::questions::{AnswerChoice, Questions};
 use super::text::RigText;
 use crate::cli::failure::CommandFailure;
+use crate::cli::printer::printable;
 
 const GENICAM: &str = "genicam";
 const V4L2: &str = "v4l2";
@@ -73,7 +74,7 @@ impl ChosenCamera {
                 Some((GENICAM, named)) => match known.map_or_else(|| offered_by_genicam(named), Ok) {
                     Ok(facts) => Self::genicam(questions, named, &facts, most_rows),
                     Err(error) if matches!(questions, Questions::Terminal) => {
-                        println!("{error}");
+                        println!("{}", printable(&error.to_string()));
                         continue;
                     }
                     Err(error) => Err(error),

@@ -99,7 +99,8 @@ fn ask_ports(
     for port in chosen {
         let answer = ask(&port);
         if is_spoken {
-            println!("{}: {}", port.display(), printable(&answer_text(answer.as_ref())));
+            let said = format!("{}: {}", port.display(), answer_text(answer.as_ref()));
+            println!("{}", printable(&said));
         }
         connected.answering.push((port, answer));
     }

@@ -11,9 +11,9 @@ use super::questions::{AnswerChoice, Questions};
 use super::text::RigText;
 use crate::cli::failure::CommandFailure;
 
-/// Lines of a video frame for each line that is drawn, and lines before the first one: those of 720p60.
+/// Lines of a video frame for each line that is drawn: those of 720p60.
 const LINES_PER_ROW: f64 = 750.0 / 720.0;
-/// Of the lines without a row, the part that is before the first one.
+/// Lines before the first one that is drawn, for each that is.
 const BEFORE_PER_ROW: f64 = 25.0 / 720.0;
 const SHORTEST_ROW_TIME_US: f64 = 0.1;
 const LONGEST_ROW_TIME_US: f64 = 10_000.0;

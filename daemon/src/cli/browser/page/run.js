@@ -66,7 +66,11 @@ function hear(event) {
       draw();
       refresh();
       break;
-    case "ask": asked = event.text; refresh(); break;
+    case "ask":
+      // What is left to do once the run is over.
+      if (!event.wants_answer) asked = event.text;
+      refresh();
+      break;
     case "finished": refresh(); break;
   }
 }
@@ -106,7 +110,6 @@ function draw() {
     : "Only root and the daemon's own user operate it.";
   by("question").hidden = !question;
   document.body.classList.toggle("asks", Boolean(question));
-  // The command is for a terminal; here the button does the same.
   by("question-text").textContent = question?.text ?? "";
   by("answer").disabled = !question?.wants_answer;
   by("run-name").textContent = session ? nameOf(session) : "No run yet";
