@@ -85,7 +85,7 @@ enum Link {
         frames: Frames,
         chunks: Option<Chunks>,
         /// The clock of a camera that cannot be asked for its time.
-        arrivals: Option<ArrivalClock>,
+        arrivals: Option<Box<ArrivalClock>>,
     },
     Lost,
     /// The owner thread is opening the lost camera.

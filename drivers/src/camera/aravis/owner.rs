@@ -82,7 +82,7 @@ pub struct OpenedCamera {
     pub capabilities: CameraCapabilities,
     /// Whether its clock can be read.
     /// Its clock, if it cannot be asked for its time.
-    pub arrivals: Option<ArrivalClock>,
+    pub arrivals: Option<Box<ArrivalClock>>,
     /// Since when it answers triggers, if it does.
     pub armed_ns: Option<i64>,
 }
@@ -221,7 +221,7 @@ impl Owner {
         if self.armed {
             device.execute("AcquisitionStart")?;
         }
-        let arrivals = clock.is_none().then(|| ArrivalClock::new(0));
+        let arrivals = clock.is_none().then(|| Box::new(ArrivalClock::new(0)));
         let opened = OpenedCamera { frames, chunks, capabilities, arrivals, armed_ns };
         Ok((Connection { device, writer, clock }, opened))
     }
