@@ -27,9 +27,10 @@ pub(super) fn examine(checkup: &mut Checkup, data: &Path, needs: Option<PlanNeed
     const FOLDER: &str = "data folder";
     // A folder that is missing is made by the daemon, not by who looks: its disk is that of the folder it will be in.
     let present = data.ancestors().find(|folder| folder.exists()).unwrap_or(Path::new("."));
-    let shown = match present == data {
-        true => data.display().to_string(),
-        false => format!("{} does not exist yet: the daemon makes it", data.display()),
+    let shown = match data.try_exists() {
+        Ok(false) => format!("{} does not exist yet: the daemon makes it", data.display()),
+        // It may also be out of sight of who looks.
+        Ok(true) | Err(_) => data.display().to_string(),
     };
     let speed = match speed(present) {
         Ok(bytes_per_s) => bytes_per_s,
