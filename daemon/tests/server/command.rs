@@ -50,7 +50,10 @@ fn a_run_is_followed_to_its_end_and_the_exit_code_tells_how_it_went() {
         let (exit, out, err) = run(&daemon, &["run", &plan(&daemon, text)]);
         assert_eq!(exit, code, "{text}: {out}{err}");
         assert!(out.contains(wanted) && out.contains(session().to_str().unwrap()), "{text}: {out}");
-        assert!(err.contains("37/75 stored") && err.contains("4 lost (camera gap)"), "{text}: {err}");
+        assert!(
+            err.contains("37/75 measurements stored") && err.contains("4 lost (camera gap)"),
+            "{text}: {err}"
+        );
         assert_eq!(out.contains("report.html"), text != "fault", "{text}: {out}");
         assert_eq!(err.contains("unplugged"), text == "fault", "{text}: {err}");
         let (quiet_exit, quiet_out, quiet_err) = run(&daemon, &["run", "--quiet", &plan(&daemon, text)]);
@@ -249,7 +252,7 @@ fn who_watches_a_run_is_told_its_state_and_progress_at_once() {
         command(&daemon, &["watch"]).stderr(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap();
     let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
     assert_eq!(lines.next().unwrap().unwrap(), "running");
-    assert!(lines.next().unwrap().unwrap().contains("37/75 stored"));
+    assert!(lines.next().unwrap().unwrap().contains("37/75 measurements stored"));
     assert_eq!(run(&daemon, &["cancel"]).0, 0);
     assert_eq!(child.wait().unwrap().code(), Some(3));
 }
