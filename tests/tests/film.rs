@@ -20,6 +20,8 @@ use raysweep_session::film::{CycleEntry, TransportFilm};
 use raysweep_session::manifest;
 use raysweep_sim::{PlaneRig, PlaneSetup};
 use raysweep_tests::{Bench, Ended, data, end_of, rig_text};
+use raysweep_transport::plane::relative_rows;
+use raysweep_transport::quality::median_profile_error;
 
 const ROWS: usize = 24;
 const COLUMNS: usize = 16;
@@ -449,4 +451,46 @@ fn zarr_reads_a_film() {
     let said =
         format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
     assert!(output.status.success(), "{said}");
+}
+
+#[test]
+fn frames_that_a_flying_spot_cuts_are_left_out_or_modelled() {
+    // Exposures of 600 us: at 300 us they begin while the pixel's own row is drawn, at -300 us they end.
+    const CUT_US: [f64; 5] = [-307.0, -303.0, 296.0, 300.0, 304.0];
+    const UNCUT_US: [f64; 11] =
+        [-1500.0, -1000.0, -640.0, -360.0, -270.0, 0.0, 270.0, 360.0, 640.0, 1000.0, 1500.0];
+    let scene = "scene = \"v-groove\"\nscene_rows = 24\nscene_columns = 16\nseed = 5";
+    let sim = "[sim.sensor]\nnoise = false\n[sim.projector]\nspot = \"bidirectional\"\n[sim.vsync]\njitter_us = 0.0\n";
+    let ignored = rig_text(720, scene, sim);
+    let known = ignored.replace("[sim]\n", "spot = \"flying\"\n[sim]\n");
+    assert_ne!(ignored, known);
+    let modelled = known
+        .replace("spot = \"flying\"", "spot = \"flying\"\nscan = \"bidirectional\"\nbeam_sigma_rows = 0.0")
+        .replace("[vsync]", "projector_columns = [0, 1]\n[vsync]");
+    let delays_us = [&CUT_US[..], &UNCUT_US].concat();
+    let error = |rig: &str, delays_us: &[f64]| {
+        let bench = Bench::new(rig);
+        let plan =
+            format!("kind = \"film\"\n[film]\ncycles = 2\nexposure_us = 600\ndelay_us = {delays_us:?}\n");
+        let warned = bench.runner.check(&plan).unwrap().warnings.iter().any(|it| it.contains("flying spot"));
+        let ended = bench.run(&plan);
+        let film = TransportFilm::open(&ended.session.join("transport_film.zarr")).unwrap();
+        let found = film.read(1).unwrap().unwrap();
+        let u_min = film.attributes()["u_min"].as_i64().unwrap() as i32;
+        let rows = u_min..=u_min + found.len_of(Axis(0)) as i32 - 1;
+        let rig = Rig::load(&bench.folder.path().join("rig.toml")).unwrap();
+        let scene = rig.simulated().unwrap().scene().transport.index_axis(Axis(3), 0).to_owned();
+        (median_profile_error(found.view(), relative_rows(scene.view(), &rows).view()), warned)
+    };
+    let (ignored, _) = error(&ignored, &delays_us);
+    let (left_out, warned) = error(&known, &delays_us);
+    assert!(warned, "check says which settings are left out");
+    let (uncut, warned) = error(&known, &UNCUT_US);
+    assert!(!warned);
+    let (modelled, warned) = error(&modelled, &delays_us);
+    assert!(!warned);
+    println!("{ignored} {left_out} {uncut} {modelled}");
+    assert_eq!(left_out, uncut, "the other frames decide, and only they");
+    assert!(left_out < ignored / 2.0, "{left_out} {ignored}");
+    assert!(modelled < ignored / 2.0, "{modelled} {ignored}");
 }

@@ -19,6 +19,7 @@ use crate::findings::{Choices, choose, rows_to_choose_by};
 use crate::flicker::{FrameStamps, RoomFindings, RoomFlicker, RoomImages, on_one_clock, stamps};
 use crate::jitter::{StripFindings, StripGauge, StripLight};
 use crate::schedule::{PointRole, Schedule, SweepGeometry};
+use crate::spot::SpotCut;
 use crate::stack::SweepStack;
 use crate::stage_refused::StageRefused;
 use crate::strips::{NotSolved, Strip};
@@ -450,10 +451,13 @@ impl Snapshot for DemuxFold {
         let mut fold = self.clone();
         let sampled = rows_to_choose_by(self.geometry.height);
         fold.watch_room(&sampled, |is_wanted| of_rows(&self.taken, &sampled, is_wanted))?;
-        let SweepStack { settings, images, valid, .. } = fold.stack(&rows, fold.taken.clone())?;
+        let mut stack = fold.stack(&rows, fold.taken.clone())?;
+        let cut = SpotCut::of(&self.geometry, &stack.timing, &stack.settings).map_err(refused)?;
+        stack.keep(|n| cut.keeps(n));
+        let SweepStack { settings, images, valid, .. } = stack;
         let valid = valid.as_ref().map(|valid| valid.view());
         self.demux()
-            .and_then(|demux| demux.with_settings(settings))
+            .and_then(|demux| cut.modelled_by(demux.with_settings(settings)?))
             .and_then(|demux| match before {
                 Some(before) => demux.solve_from(before, images.view(), valid, go_on),
                 None => demux.solve_while(images.view(), valid, go_on),

@@ -4,12 +4,13 @@ use std::sync::Arc;
 
 use ndarray::{Array2, Array3, Axis};
 use raysweep_core::{CameraCapabilities, CameraSettings, Counts};
-use raysweep_transport::plane::{Demux, Setting, Transport};
+use raysweep_transport::plane::{Demux, PlaneError, Setting, Transport};
 
 use crate::calibrated::{CalibrationDrift, Images};
 use crate::demux::{DEMUX, DemuxFold, DemuxOptions};
 use crate::jitter::StripGauge;
 use crate::schedule::{Schedule, SweepGeometry};
+use crate::spot::SpotCut;
 use crate::stage_refused::StageRefused;
 use crate::strips::NotSolved;
 use crate::unit::Unit;
@@ -191,12 +192,12 @@ impl FilmSolver {
         dark: &Array2<f32>,
         go_on: &(dyn Fn() -> bool + Sync),
     ) -> Result<Transport, NotSolved> {
-        let FilmStack { settings, images, valid } = self.stack(frames, dark);
-        let settings = settings.iter().map(|setting| setting.earlier(self.late_us)).collect();
-        self.demux
-            .with_settings(settings)
+        let mut stack = self.stack(frames, dark);
+        stack.settings.iter_mut().for_each(|setting| *setting = setting.earlier(self.late_us));
+        self.without_spot(&mut stack)
+            .and_then(|cut| cut.modelled_by(self.demux.with_settings(stack.settings)?))
             .and_then(|demux| {
-                demux.solve_while(images.view(), valid.as_ref().map(|valid| valid.view()), go_on)
+                demux.solve_while(stack.images.view(), stack.valid.as_ref().map(|valid| valid.view()), go_on)
             })
             .map_err(|error| NotSolved { of: "film", what: error.to_string() })
     }
@@ -215,14 +216,22 @@ impl FilmSolver {
             self.first = Some(first);
             return None;
         }
-        let FilmStack { settings, mut images, valid } = first.sum?;
-        images /= first.cycles as f32;
+        let mut mean = first.sum?;
+        mean.images /= first.cycles as f32;
+        self.without_spot(&mut mean).ok()?;
         let rows: Vec<usize> = (0..self.geometry.height).collect();
-        let valid = valid.as_ref().map(|valid| valid.view());
-        let images = Images { rows: &rows, images: images.view(), valid };
-        let drift = CalibrationDrift::of(self.demux.timing(), &settings, &images);
+        let valid = mean.valid.as_ref().map(|valid| valid.view());
+        let images = Images { rows: &rows, images: mean.images.view(), valid };
+        let drift = CalibrationDrift::of(self.demux.timing(), &mean.settings, &images);
         self.late_us = drift.late_us;
         Some(drift)
+    }
+
+    /// Leaves out the images that a flying spot makes unreliable.
+    fn without_spot(&self, stack: &mut FilmStack) -> Result<SpotCut, PlaneError> {
+        let cut = SpotCut::of(&self.geometry, self.demux.timing(), &stack.settings)?;
+        stack.keep(|n| cut.keeps(n));
+        Ok(cut)
     }
 
     /// These frames as the model sees them.
@@ -249,6 +258,18 @@ impl FilmSolver {
             setting.earlier(late_us.unwrap_or(0.0))
         };
         FilmStack { settings: frames.iter().map(setting).collect(), images, valid }
+    }
+}
+
+impl FilmStack {
+    /// Keeps the images for whose index `kept` returns true.
+    fn keep(&mut self, kept: impl Fn(usize) -> bool) {
+        let kept: Vec<usize> = (0..self.settings.len()).filter(|&n| kept(n)).collect();
+        if kept.len() < self.settings.len() {
+            self.settings = kept.iter().map(|&n| self.settings[n].clone()).collect();
+            self.images = self.images.select(Axis(0), &kept);
+            self.valid = self.valid.as_ref().map(|valid| valid.select(Axis(0), &kept));
+        }
     }
 }
 

@@ -7,11 +7,11 @@ use std::ops::Range;
 use ndarray::{Array3, Axis, s};
 use raysweep_transport::plane::board::CalibrationCovariance;
 use raysweep_transport::plane::calibrate::{
-    BeamEstimate, CalibrateError, Choice, FlyingSpot, Optics, OpticsEstimate, Sample, candidates,
-    choose_prior, estimate_optics, settings_on_direct_row,
+    BeamEstimate, CalibrateError, Choice, Optics, OpticsEstimate, Sample, candidates, choose_prior,
+    estimate_optics,
 };
 use raysweep_transport::plane::{
-    Beam, Coupled, Coupling, Demux, NoiseModel, PlaneError, Prior, RowTiming, Transport,
+    Beam, Coupled, Coupling, Demux, NoiseModel, PlaneError, Prior, RowTiming, Setting, Transport,
 };
 
 use crate::bracket::BracketImage;
@@ -19,6 +19,7 @@ use crate::calibrated;
 use crate::demux::DemuxOptions;
 use crate::flicker::RoomFindings;
 use crate::schedule::{Spot, SweepGeometry};
+use crate::spot::SpotCut;
 use crate::stack::SweepStack;
 
 /// Smaller offsets of direct light are ignored, because modelling them requires several models per row.
@@ -103,7 +104,13 @@ pub fn choose(
     };
     let all: Vec<usize> = (0..stack.settings.len()).collect();
     let settings = stack.settings.clone();
-    let (cut, spot) = cut_by_the_spot(geometry, &stack, &mut findings)?;
+    let cut = SpotCut::of(geometry, &stack.timing, &stack.settings)?;
+    findings.add_spot(geometry.spot, &cut, &stack.settings);
+    let (cut, spot) = match cut {
+        SpotCut::Nowhere | SpotCut::Everywhere => (Vec::new(), None),
+        SpotCut::LeftOut { cut } => (cut, None),
+        SpotCut::Modelled { cut, spot } => (cut, Some(spot)),
+    };
     stack.keep(|n| !cut.contains(&n));
     let calibration = geometry.calibration.as_ref().map(|calibration| {
         let late_sd_us = findings.check_calibration(&mut stack, rows);
@@ -175,6 +182,29 @@ impl Findings {
     pub(crate) fn add_room(&mut self, RoomFindings { remark, warning }: RoomFindings) {
         self.remarks.extend(remark);
         self.warnings.extend(warning);
+    }
+
+    /// Adds what is done about a flying spot in the images of these settings.
+    fn add_spot(&mut self, drawn: Spot, cut: &SpotCut, settings: &[Setting]) {
+        let Spot::Flying(_) = drawn else { return };
+        let said = match cut {
+            SpotCut::Nowhere => "no exposure begins or ends while it draws the direct row".into(),
+            SpotCut::Everywhere => "every exposure begins or ends while it draws the direct row, so none is left out and direct light is not to be trusted: move the delays by a row".into(),
+            SpotCut::Modelled { cut, .. } => format!(
+                "modelled in the {} images whose exposure begins or ends while it draws the direct row",
+                cut.len()
+            ),
+            SpotCut::LeftOut { cut } => {
+                let at = |&n: &usize| (settings[n].delays_us[0], settings[n].exposure_us);
+                self.left_out_us = cut.iter().map(at).collect();
+                format!(
+                    "{} images are left out, because their exposure begins or ends while it draws the direct row, and the rig file does not say when it passes a pixel (projector.scan, camera.projector_columns, projector.beam_sigma_rows = 0); {} are kept",
+                    cut.len(),
+                    settings.len() - cut.len()
+                )
+            }
+        };
+        self.remarks.push(("flying spot", said));
     }
 
     /// Checks the calibration by a stack that contains only the camera rows `rows`, and corrects the delays of its
@@ -406,40 +436,4 @@ fn say_beam(estimate: Option<&Result<BeamEstimate, CalibrateError>>, sigma_rows:
 /// A prior with its weights, as text.
 pub fn name(prior: Prior) -> String {
     format!("{} (alpha {}, beta {})", prior.name(), prior.alpha(), prior.beta())
-}
-
-/// The images with an edge on the direct row, which a flying spot makes unreliable. Also returns the spot's path, if
-/// the rig knows when it passes each pixel's column and the beam allows modelling it; without the path these images
-/// are left out.
-fn cut_by_the_spot(
-    geometry: &SweepGeometry,
-    stack: &SweepStack,
-    findings: &mut Findings,
-) -> Result<(Vec<usize>, Option<FlyingSpot>), PlaneError> {
-    let Spot::Flying(_) = geometry.spot else { return Ok((Vec::new(), None)) };
-    let cut = settings_on_direct_row(&stack.timing, &stack.settings, 0.0)?;
-    let mut say = |what: String| findings.remarks.push(("flying spot", what));
-    if cut.is_empty() {
-        say("no exposure begins or ends while it draws the direct row".into());
-        return Ok((cut, None));
-    }
-    if cut.len() == stack.settings.len() {
-        say("every exposure begins or ends while it draws the direct row, so none is left out and direct light is not to be trusted: move the delays by a row".into());
-        return Ok((Vec::new(), None));
-    }
-    if let Some(spot) = geometry.modelled_spot() {
-        say(format!(
-            "modelled in the {} images whose exposure begins or ends while it draws the direct row",
-            cut.len()
-        ));
-        return Ok((cut, Some(spot)));
-    }
-    say(format!(
-        "{} images are left out, because their exposure begins or ends while it draws the direct row, and the rig file does not say when it passes a pixel (projector.scan, camera.projector_columns, projector.beam_sigma_rows = 0); {} are kept",
-        cut.len(),
-        stack.settings.len() - cut.len()
-    ));
-    let at = |&n: &usize| (stack.settings[n].delays_us[0], stack.settings[n].exposure_us);
-    findings.left_out_us = cut.iter().map(at).collect();
-    Ok((cut, None))
 }

@@ -3,7 +3,7 @@
 use raysweep_config::RigFile;
 use raysweep_config::rig::plane::NoiseOrigin;
 use raysweep_core::CameraCapabilities;
-use raysweep_pipeline::{DemuxFold, Point, PointRole, Spot, prior_name};
+use raysweep_pipeline::{DemuxFold, Point, PointRole, SpotCut, prior_name};
 use raysweep_processing::plane::PlaneTask;
 use raysweep_proto::{
     BetterPlan, DesignParams, DesignReport, ErrorCode, ErrorRange, ExpectedError, NoiseEstimate, NoiseSource,
@@ -14,7 +14,6 @@ use raysweep_transport::plane::advice::{
     white_light,
 };
 use raysweep_transport::plane::board::CalibrationParameter;
-use raysweep_transport::plane::calibrate::settings_on_direct_row;
 use raysweep_transport::plane::{Demux, PlaneError, Setting};
 
 use super::foresight::periods;
@@ -298,15 +297,13 @@ impl<'a, T: Searched> Adviser<'a, T> {
             return None;
         }
         let timing = self.demux.timing();
-        let cut = match task.geometry.spot {
-            Spot::Uniform => Vec::new(),
-            Spot::Flying(_) if task.geometry.modelled_spot().is_some() => Vec::new(),
-            Spot::Flying(_) => settings_on_direct_row(timing, &settings, 0.0).ok()?,
-        };
+        let cut = SpotCut::of(&task.geometry, timing, &settings).ok()?;
+        if cut == SpotCut::Everywhere {
+            settings.clear();
+        }
         let mut index = 0..;
-        settings.retain(|setting| {
-            !index.next().is_some_and(|index| cut.contains(&index)) && !self.saturates(setting)
-        });
+        settings
+            .retain(|setting| index.next().is_some_and(|index| cut.keeps(index)) && !self.saturates(setting));
         Some(Usable { settings, noise: self.noise(other, design.frames) })
     }
 

@@ -2,8 +2,9 @@
 
 use raysweep_config::ConfigError;
 use raysweep_core::CameraCapabilities;
-use raysweep_pipeline::{DemuxFold, Point, PointRole};
+use raysweep_pipeline::{DemuxFold, Point, PointRole, SpotCut};
 use raysweep_processing::plane::PlaneTask;
+use raysweep_transport::plane::Setting;
 use raysweep_transport::plane::board::FlickeringLamp;
 use raysweep_transport::plane::calibrate::{averaged_share, can_be_followed, cancelling_frames};
 
@@ -21,6 +22,8 @@ pub struct Model {
     pub condition: f64,
     /// VSYNC periods per frame, for each point.
     pub periods: Vec<u64>,
+    /// The settings that a flying spot makes unreliable, by their planned delays.
+    cut: SpotCut,
 }
 
 impl Model {
@@ -37,13 +40,20 @@ impl Model {
             .map_err(|error| no_model(error.to_string()))?;
         let condition = demux.condition(geometry.height / 2).map_err(|error| no_model(error.to_string()))?;
         let reach = demux.reach();
+        let planned: Vec<Setting> = task
+            .settings()
+            .map(|(_, point)| geometry.setting(&[point.delay_us], point.exposure_us))
+            .collect();
+        let cut =
+            SpotCut::of(geometry, demux.timing(), &planned).map_err(|error| no_model(error.to_string()))?;
         for point in &task.schedule.points {
             let shot = geometry.shot(point, camera.trigger_latency_us);
             camera.allows(&shot.settings).map_err(no_model)?;
         }
         let periods = task.schedule.points.iter().map(|point| periods(task, camera, point)).collect();
         // JSON has no infinity.
-        Ok(Self { reach_rows: (*reach.start(), *reach.end()), condition: condition.min(f64::MAX), periods })
+        let reach_rows = (*reach.start(), *reach.end());
+        Ok(Self { reach_rows, condition: condition.min(f64::MAX), periods, cut })
     }
 
     /// Number of relative rows whose light can be distinguished.
@@ -91,6 +101,21 @@ impl Model {
         }
     }
 
+    fn spot_warning(&self, task: &PlaneTask) -> Option<String> {
+        let begin_or_end = "begin or end while the flying spot draws the pixel's own row";
+        match &self.cut {
+            SpotCut::Nowhere | SpotCut::Modelled { .. } => None,
+            SpotCut::LeftOut { cut } => Some(format!(
+                "{} of {} settings {begin_or_end}, and are left out: state projector.scan, camera.projector_columns and projector.beam_sigma_rows = 0, or move their delays by a row",
+                cut.len(),
+                task.settings().count()
+            )),
+            SpotCut::Everywhere => Some(format!(
+                "all settings {begin_or_end}, so direct light is not to be trusted: move delays by a row"
+            )),
+        }
+    }
+
     /// Warnings for the operator.
     pub fn warnings(&self, task: &PlaneTask) -> Vec<String> {
         let (geometry, condition) = (&task.geometry, self.condition);
@@ -107,6 +132,7 @@ impl Model {
                 task.settings().count()
             ));
         }
+        warnings.extend(self.spot_warning(task));
         let brightest_rows = task
             .schedule
             .points

@@ -109,8 +109,8 @@ mod tests {
     use raysweep_transport::plane::{NoiseModel, PixelResponse, RESPONSE_ROWS, Setting};
 
     use super::*;
-    use crate::demux::{DemuxOptions, Solved};
-    use crate::schedule::{Point, Schedule, Spot, SweepGeometry};
+    use crate::demux::{DemuxOptions, Snapshot, Solved};
+    use crate::schedule::{Point, Schedule, Spot, SpotScan, SweepGeometry};
     use crate::strips::Strip;
     use crate::unit::Unit;
 
@@ -193,7 +193,12 @@ mod tests {
     }
 
     fn push_points(fold: &mut DemuxFold, points: &[Point], images: &Kept) {
-        for ((ordinal, point), image) in (0..).zip(points).zip(&images.0) {
+        push_where(fold, points, images, |_| true);
+    }
+
+    fn push_where(fold: &mut DemuxFold, points: &[Point], images: &Kept, is_taken: fn(&Point) -> bool) {
+        for ((ordinal, point), image) in (0..).zip(points).zip(&images.0).filter(|((_, it), _)| is_taken(it))
+        {
             let unit = Unit {
                 id: SettingsId { point: ordinal, attempt: 0 },
                 frames: 1,
@@ -232,6 +237,23 @@ mod tests {
         // Edges lie 2.5 rows of 20 us from the direct row and further; with the other delays, a quarter of a row.
         assert!(one_band(100.0, 100.0));
         assert!(!one_band(25.0, 60.0));
+    }
+
+    #[test]
+    fn a_live_estimate_leaves_out_what_a_flying_spot_cuts() {
+        let schedule = schedule();
+        let images = schedule.points.iter().enumerate().map(|(ordinal, point)| image(ordinal, point));
+        let images = Kept(images.collect());
+        let estimate = |geometry: &SweepGeometry, is_taken: fn(&Point) -> bool| {
+            let mut fold = DemuxFold::new(DemuxOptions::default(), &schedule, geometry).unwrap();
+            push_where(&mut fold, &schedule.points, &images, is_taken);
+            fold.estimate(None, &|| true).unwrap().t
+        };
+        let flying = SweepGeometry { spot: Spot::Flying(SpotScan::Unknown), ..geometry() };
+        // An exposure of 60 us at 25 us begins, and one at -25 us ends, 5 us from the centre of the direct row.
+        let uncut = estimate(&geometry(), |point| point.delay_us.abs() != 25.0);
+        assert_eq!(estimate(&flying, |_| true), uncut);
+        assert_ne!(estimate(&geometry(), |_| true), uncut);
     }
 
     /// The same rig, calibrated: its white level falls off to one side, and a corner is not lit.
