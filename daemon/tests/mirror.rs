@@ -364,7 +364,7 @@ fn no_light_without_a_word() {
     lab.client().run(&RunParams { plan: plan(2), ..RunParams::default() }).unwrap();
     let (state, error) = lab.ended();
     assert_eq!(state, RunState::Faulted);
-    assert!(error.unwrap().contains("close the enclosure"));
+    assert!(error.as_ref().is_some_and(|said| said.contains("close the enclosure")), "{error:?}");
     assert_eq!(lab.lit(), 0);
 }
 

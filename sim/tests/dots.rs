@@ -431,7 +431,8 @@ fn by_the_hosts_clock_frames_come_at_their_time_and_late_hosts_lose_some() {
     let DotsDevices { mut camera, mut mirror, clock, truth, .. } = rig(config).open(1000.0, None);
     camera.arm().unwrap();
     mirror.load(&path).unwrap();
-    mirror.start(20).unwrap();
+    // 40 s, more than any host stands still.
+    mirror.start(2000).unwrap();
     let mut buffer = FramePool::new(1, 2 * 12 * 32).take();
     let mut next = || {
         let stamp = camera.next_frame(&mut buffer, Duration::from_secs(1)).unwrap().unwrap();
@@ -449,7 +450,7 @@ fn by_the_hosts_clock_frames_come_at_their_time_and_late_hosts_lose_some() {
     while let Some(stamp) = camera.next_frame(&mut buffer, Duration::from_millis(20)).unwrap() {
         assert!(truth.frame(stamp.seq).is_some());
     }
-    assert!(truth.frames() < 400);
+    assert!(truth.frames() < 40_000);
     assert!(mirror.feed().is_err());
 }
 

@@ -19,6 +19,9 @@ use crate::judge::{
 use crate::kinds::Kind;
 use crate::process::Process;
 
+/// A run that has not come so far after this time hangs: a busy machine takes a minute.
+const HUNG: Duration = Duration::from_secs(600);
+
 /// A session that nothing interrupted, in the folder in which others of its kind are killed.
 pub struct Reference<'a> {
     kind: &'a Kind,
@@ -101,7 +104,7 @@ impl<'a> Reference<'a> {
             Moment::Line(line, later) => {
                 let began = Instant::now();
                 while ledger().map_or(0, |ledger| ledger.lines().count()) < *line {
-                    assert!(began.elapsed() < Duration::from_secs(60), "no line {line} after a minute");
+                    assert!(began.elapsed() < HUNG, "no line {line} after {HUNG:?}");
                     std::thread::sleep(Duration::from_micros(200));
                 }
                 std::thread::sleep(*later);
