@@ -41,6 +41,8 @@ pub struct ImageSensor {
     /// Dark current in electrons per microsecond, `[t, s]` row-major.
     dark_e_per_us: Vec<f32>,
     black_dn: f32,
+    /// By how much each count of a signal lowers it, relative to itself.
+    compression_per_dn: f32,
     /// Distance between neighbouring converter codes, in counts.
     step_dn: f32,
     max_dn: f32,
@@ -79,6 +81,7 @@ impl ImageSensor {
             offset_e.iter_mut().zip(columns.iter().cycle()).for_each(|(offset, column)| *offset += column);
         }
         let step_dn = 2_f32.powi(scale.bits.saturating_sub(config.adc_bits.max(1)) as i32);
+        let max_dn = 2_f32.powi(scale.bits as i32) - step_dn;
         Self {
             config: config.clone(),
             seed,
@@ -89,7 +92,8 @@ impl ImageSensor {
             electrons_per_dn: electrons_per_dn as f32,
             black_dn: scale.black_dn as f32,
             step_dn,
-            max_dn: 2_f32.powi(scale.bits as i32) - step_dn,
+            max_dn,
+            compression_per_dn: config.compression_percent as f32 / 100.0 / (max_dn - scale.black_dn as f32),
         }
     }
 
@@ -115,7 +119,8 @@ impl ImageSensor {
                         electrons += variance.sqrt() * z;
                     }
                     let electrons = (electrons + offsets[s]).min(self.config.full_well_e as f32);
-                    let level = self.black_dn + electrons / self.electrons_per_dn;
+                    let signal_dn = electrons / self.electrons_per_dn;
+                    let level = self.black_dn + signal_dn * (1.0 - self.compression_per_dn * signal_dn);
                     *count = ((level / self.step_dn).round() * self.step_dn).clamp(0.0, self.max_dn) as u16;
                 }
             },

@@ -204,6 +204,43 @@ fn a_board_or_light_of_no_use_is_refused_with_the_reason() {
 }
 
 #[test]
+fn a_camera_that_is_not_linear_is_straightened_or_refused() {
+    // The simulator shortens counts by a parabola; the calibration lengthens them by one: they differ at second order.
+    let camera = |percent: f64| {
+        format!("{UNKNOWN}")
+            .replace("[sim.sensor]\n", &format!("[sim.sensor]\ncompression_percent = {percent}\n"))
+    };
+    let bench = Bench::new(&corner(&camera(2.0)));
+    let rig = Rig::load(&bench.folder.path().join("rig.toml")).unwrap();
+    let calibrated = bench.run(&quick());
+    assert_eq!(calibrated.state, "complete", "{:?}", calibrated.error);
+    let found = kept(&calibrated.session);
+    let [per_dn, sd] = found.header.light.linearity_per_dn.unwrap();
+    let expected = 0.02 / (4095.0 - 64.0);
+    println!("curve: {per_dn:.3e} +- {sd:.1e}, {expected:.3e} was simulated");
+    assert!((per_dn / expected - 1.0).abs() < 0.1 && sd < 0.02 * expected);
+    assert_eq!(found.header.checks["bend"][1], 0.03);
+
+    let straightened = error(&bench.run(SWEEP), rig.simulated().unwrap());
+    let current = current_in(&bench.folder.path().join("sessions"));
+    let text = fs::read_to_string(current.join("calibration.toml")).unwrap();
+    let lines = text.lines().filter(|line| !line.starts_with("linearity_per_dn"));
+    fs::write(current.join("calibration.toml"), lines.collect::<Vec<_>>().join("\n")).unwrap();
+    let bent = error(&bench.run(SWEEP), rig.simulated().unwrap());
+    println!("error of T: {straightened:.4} straightened, {bent:.4} as counted");
+    assert!(straightened < 0.025 && straightened < 0.95 * bent);
+
+    let bench = Bench::new(&small("[sim.sensor]\ncompression_percent = 5.0\n"));
+    let ended = bench.run(&quick());
+    assert_eq!(ended.state, "faulted");
+    assert!(message(&ended).contains("gamma"), "{}", message(&ended));
+    // A camera that cannot be exposed for so long is taken as linear.
+    let ended = bench.run(&format!("{}passes = 0\n", quick()));
+    assert_eq!(ended.state, "complete", "{:?}", ended.error);
+    assert_eq!(kept(&ended.session).header.light.linearity_per_dn, None);
+}
+
+#[test]
 fn a_calibration_of_other_devices_or_a_damaged_one_is_refused_unless_overridden() {
     let mut bench = Bench::new(&small(""));
     let first = bench.run(&quick());

@@ -184,8 +184,8 @@ impl DemuxFold {
                     .into(),
             });
         }
-        let white = self.geometry.white_of(rows);
-        let (scale, measured) = (white.mapv(|dn| (1.0 / dn) as f32), white.mapv(f64::is_finite));
+        let scale = self.geometry.scale_of(rows);
+        let measured = self.geometry.white_of(rows).mapv(f64::is_finite);
         let valid_of = |taken: &SweepImage| taken.valid(self.geometry.saturation_dn);
         let saturates = |taken: &Arc<SweepImage>| valid_of(taken).iter().any(|valid| !valid);
         let shape = (taken.len(), rows.len(), self.geometry.width);
@@ -204,7 +204,7 @@ impl DemuxFold {
             }
             if let Some(dark) = self.dark_of(&darks, role) {
                 let mut image = images.index_axis_mut(Axis(0), index);
-                image.assign(&((&sample.image - &dark.image) * &scale));
+                image.assign(&scale.light(sample.image.view(), dark.image.view()));
                 if let Some(flicker) = &flicker {
                     flicker.subtract(role, self.schedule_dark(role), image);
                 }
@@ -324,7 +324,7 @@ impl DemuxFold {
         let (bracket, dark) = taken.get(&role).zip(self.dark_of(taken, role))?;
         let rows: Vec<usize> = (0..self.geometry.height).collect();
         let white = self.geometry.white_of(&rows);
-        let mut image = (&bracket.image - &dark.image) / white.mapv(|dn| dn as f32);
+        let mut image = self.geometry.scale_of(&rows).light(bracket.image.view(), dark.image.view());
         if let Some(flicker) = self.flicker(&darks_of(taken), &rows) {
             flicker.subtract(role, self.schedule_dark(role), image.view_mut());
         }
@@ -347,18 +347,17 @@ impl DemuxFold {
         let Held { first_row: held_from, mut stack, regular, darks } = held;
         let first_row = rows.start;
         let inner = rows.start - held_from..rows.end - held_from;
-        let white = self.geometry.white_of(&rows.clone().collect::<Vec<_>>());
-        let measured = white.mapv(f64::is_finite);
+        let camera_rows: Vec<usize> = rows.clone().collect();
+        let measured = self.geometry.white_of(&camera_rows).mapv(f64::is_finite);
         let solved = rows.clone();
         let transport = choices.solve(rows, held_from, &mut stack, go_on).map_err(refused)?;
         tally.add_sweep(stack.settings.len(), &measured, &transport);
         if let Some((regular, dark)) = regular {
             let [image, dark] = [&regular, &dark].map(|taken| taken.image.slice(s![inner.clone(), ..]));
-            let mut light = (&image - &dark) / white.mapv(|dn| dn as f32);
+            let mut light = self.geometry.scale_of(&camera_rows).light(image, dark);
             let role = PointRole::Regular;
-            let rows: Vec<usize> = solved.clone().collect();
             let darks = darks.iter().map(|(role, taken)| (*role, taken.rows(inner.clone()))).collect();
-            if let Some(flicker) = self.flicker(&darks, &rows) {
+            if let Some(flicker) = self.flicker(&darks, &camera_rows) {
                 flicker.subtract(role, self.schedule_dark(role), light.view_mut());
             }
             let valid = regular.valid(self.geometry.saturation_dn).slice_move(s![inner, ..]);

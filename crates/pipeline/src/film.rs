@@ -9,6 +9,7 @@ use raysweep_transport::plane::{Demux, PlaneError, Setting, Transport};
 use crate::calibrated::{CalibrationDrift, Images};
 use crate::demux::{DEMUX, DemuxFold, DemuxOptions};
 use crate::jitter::StripGauge;
+use crate::scale::LightScale;
 use crate::schedule::{Schedule, SweepGeometry};
 use crate::spot::SpotCut;
 use crate::stage_refused::StageRefused;
@@ -123,9 +124,8 @@ const LATENCY_CYCLES: usize = 4;
 pub struct FilmSolver {
     demux: Demux,
     geometry: SweepGeometry,
-    /// Light per count of each pixel, `[t, s]`.
-    scale: Array2<f32>,
-    /// Which pixels have a scale.
+    scale: LightScale,
+    /// Which pixels have a scale, `[t, s]`.
     measured: Array2<bool>,
     /// By how much later than calibrated light arrives, as far as the film has shown.
     late_us: f64,
@@ -162,8 +162,8 @@ impl FilmSolver {
         let demux = DemuxFold::new(options, schedule, geometry)?
             .demux()
             .map_err(|error| StageRefused::Invalid { name: DEMUX.into(), what: error.to_string() })?;
-        let white = geometry.white_of(&(0..geometry.height).collect::<Vec<_>>());
-        let (scale, measured) = (white.mapv(|dn| (1.0 / dn) as f32), white.mapv(f64::is_finite));
+        let rows: Vec<usize> = (0..geometry.height).collect();
+        let (scale, measured) = (geometry.scale_of(&rows), geometry.white_of(&rows).mapv(f64::is_finite));
         let first = geometry.calibration.as_ref().map(|_| FirstCycles::default());
         let strip = StripGauge::of(geometry)
             .map_err(|error| StageRefused::Invalid { name: DEMUX.into(), what: error.to_string() })?;
@@ -247,7 +247,7 @@ impl FilmSolver {
             if let Some(valid) = &mut valid {
                 valid.index_axis_mut(Axis(0), index).assign(&(image.mapv(is_unsaturated) & &self.measured));
             }
-            images.index_axis_mut(Axis(0), index).assign(&((&**image - dark) * &self.scale));
+            images.index_axis_mut(Axis(0), index).assign(&self.scale.light(image.view(), dark.view()));
         }
         let setting = |(setting, image): &(Setting, Arc<Array2<f32>>)| {
             let setting = self.geometry.setting(&setting.delays_us, setting.exposure_us);

@@ -8,6 +8,7 @@ use rayon::prelude::*;
 use raysweep_transport::plane::board::times::{JitterGauge, Lateness};
 use raysweep_transport::plane::{PlaneError, Setting};
 
+use crate::scale::LightScale;
 use crate::schedule::{PointRole, SweepGeometry};
 
 /// Largest accepted misfit of what should be the board, in units of its variance: what a calibration accepts.
@@ -15,12 +16,11 @@ const MOST_CHI2: f64 = 9.0;
 /// A strip that knows less than this share of the lateness's variance has no edge on its light.
 const SHOWN_SHARE: f64 = 0.5;
 
-/// The strip of a rig, and its white level.
+/// The strip of a rig, and the scale of its light.
 #[derive(Clone)]
 pub struct StripGauge {
     gauge: Arc<JitterGauge>,
-    /// Counts of a white pixel, `[t, s]` of the strip.
-    white_dn: Arc<Array2<f32>>,
+    scale: Arc<LightScale>,
     /// Standard deviation of a frame's lateness before it is measured.
     jitter_us: f64,
 }
@@ -58,8 +58,9 @@ impl StripGauge {
         let raster = &geometry.raster;
         let centre_us = raster.row_centre_us(geometry.first_row);
         let gauge = JitterGauge::new(calibration, strip, raster.period_us, centre_us)?;
-        let white_dn = calibration.white_dn.slice(s![.., gauge.columns()]).to_owned();
-        Ok(Some(Self { gauge: Arc::new(gauge), white_dn: Arc::new(white_dn), jitter_us: strip.jitter_us }))
+        let white_dn = calibration.white_dn.slice(s![.., gauge.columns()]).mapv(f64::from);
+        let scale = LightScale::new(&white_dn, calibration.linearity_per_dn);
+        Ok(Some(Self { gauge: Arc::new(gauge), scale: Arc::new(scale), jitter_us: strip.jitter_us }))
     }
 
     /// The strip's part of an image.
@@ -79,7 +80,7 @@ impl StripGauge {
     }
 
     fn lateness(&self, setting: &Setting, image: ArrayView2<f32>, dark: ArrayView2<f32>) -> Option<Lateness> {
-        let light = (&image - &dark) / &*self.white_dn;
+        let light = self.scale.light(image, dark);
         self.gauge.lateness(setting, light.view()).ok()
     }
 }

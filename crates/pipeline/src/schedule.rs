@@ -9,6 +9,8 @@ use raysweep_transport::plane::calibrate::{self, FlyingSpot};
 use raysweep_transport::plane::{Beam, CameraRows, PlaneError, RowTiming, Setting};
 use serde::Deserialize;
 
+use crate::scale::LightScale;
+
 /// The purpose of a point's image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum PointRole {
@@ -181,6 +183,12 @@ impl SweepGeometry {
         let is_measured = |dn: f64| dn >= LEAST_WHITE * self.white_dn;
         let white = |dn: f32| Some(f64::from(dn)).filter(|dn| is_measured(*dn)).unwrap_or(f64::INFINITY);
         calibration.white_dn.select(Axis(0), rows).mapv(white)
+    }
+
+    /// What converts the counts of these camera rows to light.
+    pub fn scale_of(&self, rows: &[usize]) -> LightScale {
+        let linearity_per_dn = self.calibration.as_ref().map_or(0.0, |found| found.linearity_per_dn);
+        LightScale::new(&self.white_of(rows), linearity_per_dn)
     }
 
     /// The timing of projector and camera rows for the model. An unknown beam counts as ideal.

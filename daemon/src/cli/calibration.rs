@@ -98,9 +98,9 @@ fn list(found: &[CalibrationInfo]) -> String {
 }
 
 /// The figures of a calibration with their units and standard deviations.
-fn figures(header: &CalibrationHeader) -> [(&'static str, Pair); 8] {
+fn figures(header: &CalibrationHeader) -> Vec<(&'static str, Pair)> {
     let (timing, light) = (&header.timing, &header.light);
-    [
+    let figures = [
         ("projector row time / us", timing.row_time_us),
         ("camera row time / us", timing.camera_row_time_us),
         ("exposure offset / us", timing.exposure_offset_us),
@@ -109,7 +109,10 @@ fn figures(header: &CalibrationHeader) -> [(&'static str, Pair); 8] {
         ("gain / (e/DN)", light.electrons_per_dn),
         ("read noise / e", light.read_noise_e),
         ("PRNU", light.prnu),
-    ]
+    ];
+    let curve =
+        light.linearity_per_dn.map(|per_dn| ("curve: a of DN (1 + a DN) / 1e-6", per_dn.map(|it| it * 1e6)));
+    figures.into_iter().chain(curve).collect()
 }
 
 fn header(header: &CalibrationHeader) -> String {

@@ -183,5 +183,6 @@ fn emva(sensor: &SimDotSensor) -> SimSensor {
         dark_current_e_per_s: 0.0,
         adc_bits: 12,
         vignetting_percent: sensor.vignetting_percent,
+        compression_percent: 0.0,
     }
 }

@@ -15,6 +15,8 @@ pub struct CalibrationPlan {
     pub frames: u32,
     /// Frames averaged of each picture of sparse rows.
     pub picture_frames: u32,
+    /// Largest number of passes of the beam in the exposures that show how linear the camera is; 0: none are taken.
+    pub passes: u32,
     /// Delays at which the arrival of each row's light is measured, with three frames each.
     pub delays: u32,
     /// Frames whose measured delay deviates by more than this are dropped.
@@ -27,12 +29,15 @@ impl Default for CalibrationPlan {
             exposure_us: Axis::List(vec![60.0, 600.0, 1200.0, 3600.0]),
             frames: 16,
             picture_frames: 4,
+            passes: 3,
             delays: 64,
             max_jitter_us: 100.0,
         }
     }
 }
 
+/// More passes of the grey would saturate.
+const MOST_PASSES: u32 = 3;
 /// Maximum number of exposures.
 const MAX_EXPOSURES: usize = 32;
 
@@ -56,6 +61,13 @@ impl CalibrationPlan {
         }
         document.check_count(&["calibration", "frames"], self.frames.into(), 4..=1024);
         document.check_count(&["calibration", "picture_frames"], self.picture_frames.into(), 1..=1024);
+        if self.passes == 1 || self.passes > MOST_PASSES {
+            let message = format!(
+                "calibration.passes = {}: must be 2 to {MOST_PASSES}, or 0 for a camera that cannot be exposed for two VSYNC periods",
+                self.passes
+            );
+            document.refuse(&["calibration", "passes"], message);
+        }
         document.check_count(&["calibration", "delays"], self.delays.into(), 24..=1024);
         document.check_range(&["calibration", "max_jitter_us"], self.max_jitter_us, 0.1..=10_000.0);
     }

@@ -270,6 +270,8 @@ pub struct SimSensor {
     pub adc_bits: u32,
     /// Loss of light in the corners of the image, in percent.
     pub vignetting_percent: f64,
+    /// By how much counts of full scale fall short of a straight line, in percent; half of it at half of full scale.
+    pub compression_percent: f64,
 }
 
 impl Default for SimSensor {
@@ -287,6 +289,7 @@ impl Default for SimSensor {
             dark_current_e_per_s: 50.0,  // [A]
             adc_bits: 12,
             vignetting_percent: 0.0,
+            compression_percent: 0.0,
         }
     }
 }

@@ -273,6 +273,7 @@ mod tests {
             covariance: CalibrationCovariance::independent([0.0; 5]),
             response: PixelResponse::with_beam(places, &shares).unwrap(),
             white_dn,
+            linearity_per_dn: 0.0,
             noise: NoiseModel { read_variance: 0.0, gain: 0.0 },
             strip: None,
             lamp: None,

@@ -11,6 +11,7 @@ use ndarray_npy::{NpzReader, NpzWriter};
 use raysweep_config::{ConfigError, RigFile};
 use raysweep_core::{CameraCapabilities, PixelFormat, io_text};
 use raysweep_session::{durable, input};
+use raysweep_transport::plane::board::images::MOST_BEND;
 use raysweep_transport::plane::board::{
     BoardCalibration, BoardStrip, CalibrationCovariance, CalibrationParameter, Estimate, FlickeringLamp,
 };
@@ -121,6 +122,10 @@ pub struct CalibratedLight {
     pub read_noise_e: Pair,
     /// Non-uniformity of the pixels' sensitivities.
     pub prnu: Pair,
+    /// `a` of the camera's curve: what it counts above the dark image, times `1 + a` of that, is proportional to the
+    /// light; `None` in files of earlier versions, which take the camera as linear.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub linearity_per_dn: Option<Pair>,
     /// Number of pixels with unusual dark current or noise.
     pub hot_pixels: usize,
     /// Standard deviation of the width of a pixel's response, relative to itself; `None` in files of earlier versions,
@@ -188,6 +193,9 @@ pub struct KeptCalibration {
     pub arrays: CalibrationArrays,
 }
 
+/// No camera with at least 8 bits is accepted with a larger `a`.
+const MOST_CURVE_PER_DN: f64 = MOST_BEND / 255.0;
+
 impl CalibrationArrays {
     fn to_bytes(&self) -> Result<Vec<u8>, String> {
         let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
@@ -238,6 +246,14 @@ impl CalibrationArrays {
             return Err(format!(
                 "seen_rows = [{first}, {end}]: must be [first row, row after the last] of the {} projector rows",
                 of.projector_rows
+            ));
+        }
+        if let Some([per_dn, sd]) = header.light.linearity_per_dn
+            && !(per_dn.abs() <= MOST_CURVE_PER_DN && sd >= 0.0)
+        {
+            return Err(format!(
+                "light.linearity_per_dn = [{per_dn}, {sd}]: must be from {} to {MOST_CURVE_PER_DN}, with a standard deviation of 0 or more",
+                -MOST_CURVE_PER_DN
             ));
         }
         let [rows, columns] = of.size;
@@ -385,6 +401,7 @@ impl KeptCalibration {
             covariance: self.covariance(),
             response,
             white_dn: self.arrays.white_dn.clone(),
+            linearity_per_dn: self.header.light.linearity_per_dn.map_or(0.0, |[per_dn, _]| per_dn),
             noise: NoiseModel { read_variance: (read_noise_e[0] / white_e).powi(2), gain: white_e.recip() },
             strip,
             lamp: self.header.ambient.as_ref().and_then(CalibratedAmbient::lamp),

@@ -8,7 +8,7 @@ use raysweep_session::ledger::{FrameStarts, PointEntry, State};
 use raysweep_session::stack::{Stack, crc32};
 use raysweep_transport::plane::board::Estimate;
 use raysweep_transport::plane::board::images::{
-    Ambient, BlackFrames, CappedFrames, CodedPictures, DarkFit, ImagesError, LightLevel, Phases,
+    Ambient, BlackFrames, CappedFrames, CodedPictures, DarkFit, ImagesError, LightLevel, Linearity, Phases,
     PhotonTransfer, Responses, RowPlaces, SensorNoise, WhiteMap, ambient, locate_rows, photon_transfer, prnu,
 };
 use raysweep_transport::plane::board::times::{BoardFrame, CoarseSweep, Columns, RowTimes, TimesError};
@@ -19,6 +19,8 @@ use crate::plane::place;
 
 /// Light of the room, of white in the time of a row, that is not worth subtracting.
 const DARK_ROOM: f64 = 2e-5;
+/// A curve is not used if full scale is known no better than this, relative to itself: lamps that flicker are in it.
+const KNOWN_BEND: f64 = 0.003;
 /// Fewer frames of an exposure do not show the room's light.
 const LEAST_AMBIENT_FRAMES: usize = 8;
 
@@ -134,7 +136,9 @@ pub struct BoardPixels {
     pub transfer: PhotonTransfer,
     /// Non-uniformity of the pixels' sensitivities.
     pub prnu: Estimate,
-    /// White.
+    /// The camera's curve; `None` if it was not measured, or could not be.
+    pub linearity: Option<Linearity>,
+    /// White, as all light in counts that are proportional to it.
     pub white: WhiteMap,
     /// The room's light, and the run whose clock its flicker has; `None` if too few of its frames have time stamps of
     /// one run.
@@ -171,8 +175,12 @@ impl BoardPixels {
         let transfer = photon_transfer(&levels, full_scale_dn, Some(usable.view()))?;
         let noise = transfer.noise();
         let frames = white.len_of(Axis(0));
-        let white = WhiteMap::new(white.view(), black.view(), full_scale_dn, noise)?;
+        let mut white = WhiteMap::new(white.view(), black.view(), full_scale_dn, noise)?;
         white.check(full_scale_dn)?;
+        let linearity = linearity(images, &dark, full_scale_dn)?;
+        if let Some(linearity) = &linearity {
+            white = white.straightened(linearity);
+        }
         let ambient = room(images, &dark, noise)?;
         if let Some((ambient, _)) = &ambient {
             ambient.check(white.level_dn.value, task.task.geometry.raster.row_time_us)?;
@@ -180,7 +188,10 @@ impl BoardPixels {
         let lit = white.lit();
         let prnu = prnu(white.white_dn.view(), Some(lit.view()), frames, noise)?;
         let black_dn = black.mean_axis(Axis(0)).unwrap_or_default();
-        let sparse = images.means(CalibrationTask::phases())? - &black_dn;
+        let mut sparse = images.means(CalibrationTask::phases())? - &black_dn;
+        if let Some(linearity) = &linearity {
+            linearity.straighten(&mut sparse);
+        }
         let phases = Phases { images: sparse.view(), frames: task.calibration.picture_frames as usize };
         let coded = images.means(task.codes())?;
         let code = CodedPictures { images: coded.view(), lines_per_block: ROWS_PER_BLOCK };
@@ -189,7 +200,7 @@ impl BoardPixels {
         let responses = Responses::new(&phases, &white, &places, projector_rows)?;
         responses.checks.check()?;
         let columns = Columns::new(responses.place.view(), responses.response.view())?;
-        Ok(Self { dark, transfer, prnu, white, ambient, places, responses, columns })
+        Ok(Self { dark, transfer, prnu, linearity, white, ambient, places, responses, columns })
     }
 
     /// The room's light in an image of a single frame, unless the room is dark.
@@ -222,6 +233,9 @@ impl BoardPixels {
         let frame = |ordinal| {
             let (image, entry) = images.image(ordinal)?;
             let mut light = image - self.dark.image(entry.exposure_us);
+            if let Some(linearity) = &self.linearity {
+                linearity.straighten(&mut light);
+            }
             if let Some(ambient_dn) = self.ambient_dn(images, purpose, entry) {
                 light -= &ambient_dn;
             }
@@ -256,6 +270,41 @@ impl BoardPixels {
             gain: 1.0 / (noise.electrons_per_dn * white_dn),
         };
         Ok(RowTimes::fit(&self.columns, &frames, &images.task.nominal(), share)?)
+    }
+}
+
+/// The camera's curve, from exposures with one, two and three passes of the beam.
+fn linearity(
+    images: &BoardImages<'_>,
+    dark: &DarkFit,
+    full_scale_dn: f32,
+) -> Result<Option<Linearity>, CalibrationError> {
+    let period_us = images.task.task.geometry.raster.period_us;
+    let taken: Vec<(f64, Array3<f32>, Array2<f32>)> = images
+        .task
+        .passes()
+        .map(|(passes, purpose)| {
+            let passes = passes as f64;
+            Ok((passes, images.frames(purpose)?, dark.image(passes * period_us)))
+        })
+        .collect::<Result<_, CalibrationError>>()?;
+    if taken.is_empty() {
+        return Ok(None);
+    }
+    let levels: Vec<LightLevel<'_>> = taken
+        .iter()
+        .map(|(light, frames, dark_dn)| LightLevel {
+            light: *light,
+            frames: frames.view(),
+            dark_dn: dark_dn.view(),
+        })
+        .collect();
+    let usable = dark.hot.mapv(|hot| !hot);
+    match Linearity::new(&levels, full_scale_dn, Some(usable.view())) {
+        Ok(found) => Ok((found.per_dn.sd * f64::from(full_scale_dn) < KNOWN_BEND).then_some(found)),
+        // In a lit room, exposures of whole periods saturate.
+        Err(ImagesError::TooFew { .. }) => Ok(None),
+        Err(error) => Err(error.into()),
     }
 }
 

@@ -29,7 +29,7 @@ pub(super) fn make(
     kept: &KeptCalibration,
 ) -> Report {
     let mut sections = Vec::new();
-    let warnings = findings.warnings();
+    let warnings = findings.warnings(task);
     if !warnings.is_empty() {
         let notes = warnings.into_iter().map(|warning| Block::Note(NoteLevel::Warning, warning));
         sections.push(section("Warnings", "", notes.collect()));
@@ -72,10 +72,16 @@ fn found(findings: &BoardFindings) -> Block {
         ("read noise / e⁻", pixels.transfer.read_noise_e, 2),
         ("non-uniformity of the pixels", pixels.prnu, 5),
     ];
-    let rows = rows.map(|(name, Estimate { value, sd }, digits)| {
+    let curve = pixels.linearity.map(|linearity| {
+        let per_mdn = |per_dn: f64| per_dn * 1e6;
+        let Estimate { value, sd } = linearity.per_dn;
+        let per_mdn = Estimate { value: per_mdn(value), sd: per_mdn(sd) };
+        ("curve of the camera: a of DN (1 + a DN) / 10⁻⁶", per_mdn, 2)
+    });
+    let rows = rows.into_iter().chain(curve).map(|(name, Estimate { value, sd }, digits)| {
         vec![name.to_owned(), format!("{value:.digits$}"), format!("{sd:.digits$}")]
     });
-    Block::Table(Table { headers: ["", "value", "± 1 sd"].map(Into::into).to_vec(), rows: rows.to_vec() })
+    Block::Table(Table { headers: ["", "value", "± 1 sd"].map(Into::into).to_vec(), rows: rows.collect() })
 }
 
 /// The room's light, if it was measured.

@@ -29,6 +29,8 @@ pub enum BoardPurpose {
     White,
     /// The same under one of the [`GREYS`].
     Grey(usize),
+    /// The board under grey, in an exposure with this many passes of the beam: how linear the camera is.
+    Passes(usize),
     /// The board under every 16th row, beginning with this one.
     Rows(usize),
     /// The board under a picture of the rows' Gray code: the highest bit first, each followed by its inverse.
@@ -52,6 +54,10 @@ pub struct BoardView {
 
 /// Levels of grey for the photon transfer.
 const GREYS: [f32; 3] = [0.25, 0.5, 0.75];
+/// Grey of which three passes stay below saturation where a pass of white has 50 to 65 % of full scale.
+const PASSES_GREY: f32 = 0.45;
+/// Frames of each number of passes.
+const PASSES_FRAMES: usize = 8;
 /// Number of pictures of sparse rows, and the distance of their rows.
 const PHASES: usize = 16;
 /// Rows with the same Gray code.
@@ -90,7 +96,8 @@ impl CalibrationTask {
         Self::with_purposes(plan, calibration, known, purposes)
     }
 
-    /// The calibration of a session with these contents, which may be from before the room's light was measured.
+    /// The calibration of a session with these contents, which may be from before the camera's linearity was measured,
+    /// or the room's light.
     pub fn stored(
         plan: &Plan,
         calibration: CalibrationPlan,
@@ -101,10 +108,14 @@ impl CalibrationTask {
         if task.contents() == contents {
             return task;
         }
-        let mut purposes = task.purposes.clone();
-        purposes.retain(|purpose| *purpose != BoardPurpose::Ambient);
-        let before = Self::with_purposes(plan, calibration, known, purposes);
-        if before.contents() == contents { before } else { task }
+        let before_passes = CalibrationPlan { passes: 0, ..calibration };
+        let purposes = purposes(&before_passes, known.file.projector.rows);
+        let earlier = [false, true].map(|has_ambient| {
+            let has = |purpose: &BoardPurpose| has_ambient || *purpose != BoardPurpose::Ambient;
+            let purposes = purposes.iter().copied().filter(has).collect();
+            Self::with_purposes(plan, before_passes.clone(), known, purposes)
+        });
+        earlier.into_iter().find(|earlier| earlier.contents() == contents).unwrap_or(task)
     }
 
     fn with_purposes(
@@ -130,6 +141,7 @@ impl CalibrationTask {
                 BoardPurpose::Arrival => (3.0 * raster.row_time_us, 1),
                 BoardPurpose::ExposureCheck => (1200.0, 1),
                 BoardPurpose::Ambient => (AMBIENT_US, 1),
+                BoardPurpose::Passes(passes) => (passes as f64 * raster.period_us, 1),
                 BoardPurpose::Black
                 | BoardPurpose::White
                 | BoardPurpose::Grey(_)
@@ -137,6 +149,8 @@ impl CalibrationTask {
             };
             let delay_us = match purpose {
                 BoardPurpose::SweepTime | BoardPurpose::Arrival | BoardPurpose::ExposureCheck => 0.0,
+                // Half a period from the light at either end.
+                BoardPurpose::Passes(_) => lag_us + (exposure_us - raster.period_us) / 2.0,
                 _ => lag_us + WHOLE_US / 2.0 - BEFORE_LIGHT_US,
             };
             Point { role, delay_us, exposure_us, frames }
@@ -173,6 +187,7 @@ impl CalibrationTask {
             BoardPurpose::Capped(_) => return BoardView { subject: Subject::Cap, picture: None },
             BoardPurpose::Black | BoardPurpose::Ambient => Pattern::Black,
             BoardPurpose::Grey(grey) => Pattern::Grey { level: GREYS[grey] },
+            BoardPurpose::Passes(_) => Pattern::Grey { level: PASSES_GREY },
             BoardPurpose::Rows(phase) => Pattern::SparseRows { phase, period: PHASES },
             BoardPurpose::RowCode(picture) => Pattern::GrayRows {
                 bit: code_bits(self.task.geometry.raster.rows) - 1 - picture as u32 / 2,
@@ -195,6 +210,11 @@ impl CalibrationTask {
     /// The levels of grey, and the purposes of their images.
     pub(super) fn greys() -> impl Iterator<Item = (f64, BoardPurpose)> {
         GREYS.into_iter().enumerate().map(|(grey, level)| (f64::from(level), BoardPurpose::Grey(grey)))
+    }
+
+    /// The numbers of passes, and the purposes of their images.
+    pub(super) fn passes(&self) -> impl Iterator<Item = (usize, BoardPurpose)> {
+        (1..=self.calibration.passes as usize).map(|passes| (passes, BoardPurpose::Passes(passes)))
     }
 
     /// The purposes of the pictures of sparse rows.
@@ -298,10 +318,13 @@ fn purposes(plan: &CalibrationPlan, projector_rows: usize) -> Vec<BoardPurpose> 
     let levels = [BoardPurpose::Black, BoardPurpose::Ambient, BoardPurpose::White]
         .map(|purpose| several(purpose, 2 * frames));
     let greys = (0..GREYS.len()).flat_map(|grey| several(BoardPurpose::Grey(grey), GREY_FRAMES));
+    let passes =
+        (1..=plan.passes as usize).flat_map(|passes| several(BoardPurpose::Passes(passes), PASSES_FRAMES));
     let codes = 2 * code_bits(projector_rows) as usize;
     capped
         .chain(levels.into_iter().flatten())
         .chain(greys)
+        .chain(passes)
         .chain((0..PHASES).map(BoardPurpose::Rows))
         .chain((0..codes).map(BoardPurpose::RowCode))
         .chain(several(BoardPurpose::SweepTime, SWEEP_TIMES))

@@ -1,7 +1,7 @@
 //! The stored images under pictures, in units of light.
 
 use ndarray::Array2;
-use raysweep_pipeline::PointRole;
+use raysweep_pipeline::{LightScale, PointRole};
 use raysweep_session::ledger::State;
 use raysweep_session::stack::{ArrayName, Stack, crc32};
 
@@ -13,8 +13,7 @@ pub(super) struct PictureImages<'a> {
     pub task: &'a PatternsTask,
     pub state: &'a State,
     pub stack: &'a Stack,
-    /// Counts of a white pixel in the time of a row, `[t, s]`.
-    white_dn: Array2<f64>,
+    scale: LightScale,
 }
 
 /// An image of light `[t, s]`, 1 for a white pixel lit by its own row.
@@ -28,7 +27,7 @@ pub(super) struct LitImage {
 impl<'a> PictureImages<'a> {
     pub fn new(task: &'a PatternsTask, state: &'a State, stack: &'a Stack) -> Self {
         let rows: Vec<usize> = (0..task.task.geometry.height).collect();
-        Self { task, state, stack, white_dn: task.task.geometry.white_of(&rows) }
+        Self { task, state, stack, scale: task.task.geometry.scale_of(&rows) }
     }
 
     /// The image of a picture in a setting.
@@ -44,9 +43,7 @@ impl<'a> PictureImages<'a> {
             Some(crc) => Some(self.read(ArrayName::Clipped, index, crc)?),
             None => None,
         };
-        let mut light = mean - dark;
-        light.zip_mut_with(&self.white_dn, |light, &white_dn| *light = (f64::from(*light) / white_dn) as f32);
-        Ok(LitImage { light, clipped, frames })
+        Ok(LitImage { light: self.scale.light(mean.view(), dark.view()), clipped, frames })
     }
 
     /// The dark image of a setting's exposure, and its frames.

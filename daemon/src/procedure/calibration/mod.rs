@@ -189,7 +189,7 @@ impl Measurement for CalibrationRun {
             let kept = found.keep(&session, ledger.state(), valid_for)?;
             found.write(&kept, &session, ledger.state(), &calibration, &rig.file)?;
             kept.use_in(&data)?;
-            warnings = found.warnings();
+            warnings = found.warnings(&calibration);
         }
         Ok(Ended { end, warnings, found: Vec::new() })
     }

@@ -179,8 +179,8 @@ impl SweepImages<'_> {
             .flatten();
         let Some((image, dark)) = self.mean(role)?.zip(dark) else { return Ok(None) };
         let geometry = &self.task.task.geometry;
-        let white = geometry.white_of(&(0..geometry.height).collect::<Vec<_>>());
-        Ok(Some((image - dark) / white.mapv(|dn| dn as f32)))
+        let scale = geometry.scale_of(&(0..geometry.height).collect::<Vec<_>>());
+        Ok(Some(scale.light(image.view(), dark.view())))
     }
 
     fn mean(&self, role: PointRole) -> Result<Option<Array2<f32>>> {

@@ -26,6 +26,8 @@ pub struct BoardCalibration {
     /// Counts above black that a pixel collects in one pass of a white picture, `[t, s]`; NaN where the board was not
     /// lit.
     pub white_dn: Array2<f32>,
+    /// `a` of the camera's curve: what it counts above the dark image, times `1 + a` of that, is proportional to the light.
+    pub linearity_per_dn: f64,
     /// Noise of one frame, in shares of white.
     pub noise: NoiseModel,
     /// Where the board stays in view during runs, if it does.

@@ -1,4 +1,4 @@
-use ndarray::{Array2, ArrayView2, ArrayView3, Axis, Zip};
+use ndarray::{Array, Array2, ArrayView2, ArrayView3, Axis, Dimension, Zip};
 use rayon::prelude::*;
 
 use super::{Estimate, ImagesError, check_frames, check_range, check_shape, is_usable, mean_image, median};
@@ -29,10 +29,14 @@ impl LightLevel<'_> {
 pub struct Linearity {
     /// `a`.
     pub per_dn: Estimate,
+    /// What full scale deviates by from a straight line, relative to itself.
+    pub bend: f64,
 }
 
-/// Largest accepted bend at full scale.
-const MOST_BEND: f64 = 0.03;
+/// Largest accepted bend.
+pub const MOST_BEND: f64 = 0.03;
+/// Standard deviations by which a bend is certainly larger.
+const CERTAIN: f64 = 3.0;
 /// Pixels whose brightest level exceeds this share of full scale may be cut off in some frames.
 const HIGHEST_SHARE: f32 = 0.97;
 
@@ -42,7 +46,7 @@ impl Linearity {
     /// whatever changes between frames; it takes at least 4 frames a level.
     ///
     /// # Errors
-    /// [`ImagesError::Curved`] beyond 3 % of `full_scale_dn`, where gamma is on; [`ImagesError::TooFew`];
+    /// [`ImagesError::Curved`] beyond 3 % of `full_scale_dn` by more than 3 standard deviations, where gamma is on; [`ImagesError::TooFew`];
     /// [`ImagesError::Shape`]; [`ImagesError::OutOfRange`].
     pub fn new(
         levels: &[LightLevel],
@@ -84,14 +88,15 @@ impl Linearity {
         let squares = of_frames.iter().map(|one| (one - mean).powi(2)).sum::<f64>();
         let sd = (squares / (frames * (frames - 1)) as f64).sqrt();
         let bend = value * f64::from(full_scale_dn);
-        if bend.is_nan() || bend.abs() > MOST_BEND {
+        let doubt = CERTAIN * sd * f64::from(full_scale_dn);
+        if bend.is_nan() || bend.abs() - doubt > MOST_BEND {
             return Err(ImagesError::Curved { bend: bend.abs(), limit: MOST_BEND });
         }
-        Ok(Self { per_dn: Estimate { value, sd } })
+        Ok(Self { per_dn: Estimate { value, sd }, bend })
     }
 
-    /// Makes an image proportional to the light; `image` has the dark image subtracted.
-    pub fn straighten(&self, image: &mut Array2<f32>) {
+    /// Makes an image, or several, proportional to the light; `image` has the dark image subtracted.
+    pub fn straighten<D: Dimension>(&self, image: &mut Array<f32, D>) {
         let a = self.per_dn.value as f32;
         image.par_mapv_inplace(|dn| dn * (1.0 + a * dn));
     }

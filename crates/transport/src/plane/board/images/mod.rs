@@ -21,7 +21,7 @@ mod white;
 pub use ambient::{Ambient, BlackFrames, Flicker, ambient};
 pub use dark::{CappedFrames, DarkFit};
 pub use error::ImagesError;
-pub use linearity::{LightLevel, Linearity, SaturationLimit};
+pub use linearity::{LightLevel, Linearity, MOST_BEND, SaturationLimit};
 pub use photon_transfer::{PhotonTransfer, photon_transfer, prnu};
 pub use place::{CodedPictures, Phases, RowPlaces, locate_columns, locate_rows};
 pub use response::{Narrower, ResponseChecks, ResponseComparison, Responses, compare_responses};
