@@ -48,8 +48,9 @@ pub struct SimCameraArguments {
     /// The rig file, whose `[sim]` says what the camera sees.
     #[arg(long, value_name = "FILE", required_unless_present = "test_pictures")]
     pub rig: Option<PathBuf>,
-    /// Instead of a scene, test pictures of this size, as fast as a client takes them.
-    #[arg(long, value_name = "WIDTHxHEIGHT", conflicts_with = "rig", value_parser = size)]
+    /// Instead of a scene, test pictures of this size, as fast as a client takes them; with --rig, beside its VSYNC and
+    /// projector.
+    #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = size)]
     pub test_pictures: Option<(usize, usize)>,
     /// Where the camera listens; each camera of a machine needs an address of its own.
     #[arg(long, default_value = "127.0.0.1")]

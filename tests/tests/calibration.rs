@@ -207,8 +207,7 @@ fn a_board_or_light_of_no_use_is_refused_with_the_reason() {
 fn a_camera_that_is_not_linear_is_straightened_or_refused() {
     // The simulator shortens counts by a parabola; the calibration lengthens them by one: they differ at second order.
     let camera = |percent: f64| {
-        format!("{UNKNOWN}")
-            .replace("[sim.sensor]\n", &format!("[sim.sensor]\ncompression_percent = {percent}\n"))
+        UNKNOWN.replace("[sim.sensor]\n", &format!("[sim.sensor]\ncompression_percent = {percent}\n"))
     };
     let bench = Bench::new(&corner(&camera(2.0)));
     let rig = Rig::load(&bench.folder.path().join("rig.toml")).unwrap();
@@ -272,6 +271,12 @@ fn a_calibration_of_other_devices_or_a_damaged_one_is_refused_unless_overridden(
         assert!(message.contains("seen_rows") || message.contains("has shape"), "{message}");
     }
     fs::copy(first.session.join("calibration.toml"), current.join("calibration.toml")).unwrap();
+    fs::remove_file(current.join("calibration.npz")).unwrap();
+    std::os::unix::fs::symlink(first.session.join("calibration.npz"), current.join("calibration.npz"))
+        .unwrap();
+    let message = refusal(&bench);
+    assert!(message.contains("link"), "{message}");
+    fs::remove_file(current.join("calibration.npz")).unwrap();
     fs::write(current.join("calibration.npz"), npz).unwrap();
     Control::check(&*bench.runner, SWEEP).unwrap();
 

@@ -122,6 +122,18 @@ pub fn replace_dir<T, E: From<Error>>(
     Ok(filled)
 }
 
+/// Calls `work` with an empty folder next to `path`, which is removed afterwards; one that a crash left behind is replaced.
+///
+/// # Errors
+/// The error of `work`, or [`Error::Io`].
+pub fn with_scratch_dir<T, E: From<Error>>(
+    path: &Path,
+    work: impl FnOnce(&Path) -> std::result::Result<T, E>,
+) -> std::result::Result<T, E> {
+    let scratch = DraftDir::create(path)?;
+    work(scratch.path())
+}
+
 /// A folder that is written gradually next to the one that it will replace, as in [`replace_dir`]. Removed if
 /// dropped without [`DraftDir::commit`].
 pub(crate) struct DraftDir {

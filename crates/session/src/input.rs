@@ -45,6 +45,14 @@ pub fn read(path: &Path, most_bytes: u64) -> io::Result<Vec<u8>> {
     read_open(&open(path, most_bytes)?, most_bytes)
 }
 
+/// As [`read`], of the file itself, not of what a symbolic link in its place leads to.
+///
+/// # Errors
+/// As [`open_itself`].
+pub fn read_itself(path: &Path, most_bytes: u64) -> io::Result<Vec<u8>> {
+    read_open(&open_itself(path, most_bytes)?, most_bytes)
+}
+
 /// As [`read`], of UTF-8 text.
 ///
 /// # Errors

@@ -31,18 +31,19 @@ fn run(arguments: &SimCameraArguments) -> Result<(), Box<dyn std::error::Error>>
         faults,
         zipped: arguments.zipped,
     };
-    if let Some((width, height)) = arguments.test_pictures {
-        let _camera = GigeCamera::start(&setup, Look::at_test_pictures((height, width)))?;
+    let pictures = arguments.test_pictures.map(|(width, height)| Look::at_test_pictures((height, width)));
+    let Some(path) = &arguments.rig else {
+        let _camera =
+            GigeCamera::start(&setup, pictures.ok_or("neither --rig nor --test-pictures is given")?)?;
         announce(arguments);
         wait_for_ever();
-    }
-    let path = arguments.rig.as_ref().ok_or("neither --rig nor --test-pictures is given")?;
+    };
     let rig = Rig::load(path)?;
     let sim = rig
         .simulated()
         .ok_or("no device of the rig file has the driver `sim`, and it names no `sim.bench`")?;
     let WireDevices { camera, bench: devices } = sim.open_for_wire();
-    let camera = Arc::new(GigeCamera::start(&setup, camera)?);
+    let camera = Arc::new(GigeCamera::start(&setup, pictures.unwrap_or(camera))?);
     let bench = rig.file.sim.bench.as_deref();
     let _bench = bench.map(|path| BenchServer::start(path, devices, camera.clone())).transpose()?;
     announce(arguments);

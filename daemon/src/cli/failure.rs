@@ -35,6 +35,10 @@ pub(super) enum CommandFailure {
     NoLiveImage,
     #[error("{}: the picture is a PNG file: give a name that ends in .png", .0.display())]
     NotPng(PathBuf),
+    #[error("{}: is no PNG file, and is not replaced by one: give another name", .0.display())]
+    OtherFile(PathBuf),
+    #[error("{}: lies in a session, to which nothing is added: give another folder", .0.display())]
+    InSession(PathBuf),
     #[error(transparent)]
     Live(#[from] LiveError),
     #[error("{0}")]
@@ -155,6 +159,8 @@ impl CommandFailure {
             Self::Plan(_) => Exit::Refused,
             Self::File { .. }
             | Self::NotPng(_)
+            | Self::OtherFile(_)
+            | Self::InSession(_)
             | Self::Calibration(_)
             | Self::Sessions(_)
             | Self::Setup(_)

@@ -13,6 +13,7 @@ mod finder_text;
 mod follow;
 mod manuals;
 mod materials;
+mod picture_file;
 mod plan_file;
 mod preview;
 mod printer;

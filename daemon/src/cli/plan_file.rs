@@ -28,7 +28,7 @@ pub(super) fn read_plan(path: &Path) -> Result<String, CommandFailure> {
 }
 
 /// Longest text that a user names: much more than the socket takes of a plan.
-const MOST_BYTES: u64 = 1 << 24;
+pub(super) const MOST_BYTES: u64 = 1 << 24;
 
 /// A short text file.
 pub(super) fn read_small(path: &Path) -> Result<String, CommandFailure> {

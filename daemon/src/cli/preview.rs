@@ -13,6 +13,7 @@ use serde_json::{Value, json};
 
 use super::exit::Exit;
 use super::failure::CommandFailure;
+use super::picture_file;
 use super::printer::Printer;
 use crate::live::{EPIPOLAR, FLOODLIT, INDIRECT, LiveError, LiveImage, LiveReader};
 
@@ -32,9 +33,7 @@ pub(super) fn preview(
     follow: bool,
     printer: Printer,
 ) -> Result<Exit, CommandFailure> {
-    if !output.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("png")) {
-        return Err(CommandFailure::NotPng(output.to_owned()));
-    }
+    picture_file::check(output)?;
     let mut client = Client::connect(socket)?;
     let file = client.status()?.live.ok_or(CommandFailure::NoLiveImage)?;
     let reader = LiveReader::open(&file)?;

@@ -4,10 +4,10 @@ use std::path::{Path, PathBuf};
 
 use raysweep_config::AnyRigFile;
 use raysweep_proto::SessionInfo;
-use raysweep_session::Session;
+use raysweep_session::{Session, input};
 
 use super::CommandFailure;
-use super::plan_file::read_small;
+use super::plan_file::MOST_BYTES;
 
 /// A run that ends the daemon again and again would otherwise be resumed, with its light, for ever.
 const MOST_BARREN_RESUMES: u32 = 3;
@@ -24,7 +24,13 @@ pub(super) fn cut_off(sessions: &[SessionInfo]) -> Result<Result<PathBuf, String
     if newest.state != "unfinished" {
         return Ok(Err(format!("nothing to resume: the newest session, {shown}, is {}", newest.state)));
     }
-    let read = |file| read_small(&newest.session.join(file));
+    // What a link leads to may be the file of another rig.
+    let read = |file| {
+        let path = newest.session.join(file);
+        input::read_itself(&path, MOST_BYTES)
+            .map(|bytes| String::from_utf8_lossy(&bytes).into_owned())
+            .map_err(|source| CommandFailure::File { path, source })
+    };
     // Calibrations and darks ask an operator to put something before the camera; a film's scene has moved on.
     let plan = toml::from_str::<toml::Table>(&read("plan.toml")?).unwrap_or_default();
     if plan.get("kind").and_then(toml::Value::as_str) != Some("sweep") {
@@ -95,6 +101,10 @@ mod tests {
         assert!(why("unfinished", &forbidden, sweep).contains("auto_resume"));
         assert!(why("unfinished", PERMITTED, "kind = \"darks\"").contains("only sweeps"));
         assert!(cut_off(&[]).unwrap().is_err());
+        let linked = [session(folder.path(), "unfinished", PERMITTED, sweep)];
+        fs::rename(folder.path().join("rig.toml"), folder.path().join("other.toml")).unwrap();
+        std::os::unix::fs::symlink("other.toml", folder.path().join("rig.toml")).unwrap();
+        assert!(cut_off(&linked).unwrap_err().to_string().contains("link"));
     }
 
     #[test]

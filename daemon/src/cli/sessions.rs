@@ -11,14 +11,15 @@ use raysweep_core::Counts;
 use raysweep_processing::ProcessError;
 use raysweep_processing::calibration::CalibrationHeader;
 use raysweep_proto::{RunParams, SessionInfo};
+use raysweep_session::Session;
 use raysweep_session::integrity::damaged_files;
 use raysweep_session::ledger::{EndState, Remark, State};
 use raysweep_session::report::{Picture, ToneMap};
-use raysweep_session::{Session, durable};
 use serde::Serialize;
 use serde_json::Value;
 
 use super::failure::CommandFailure;
+use super::picture_file;
 use super::show::{block, duration};
 use super::thumbnails;
 
@@ -417,7 +418,7 @@ pub(super) fn write_picture_of_difference(
     let [red, green, blue] = channels;
     let all = stack(Axis(2), &[red?.view(), green?.view(), blue?.view()]).map_err(failed)?;
     let png = Picture::rgb(all.view(), ToneMap { white: 1.0 }).to_png().map_err(ProcessError::from)?;
-    durable::write(&file, &png).map_err(ProcessError::from)?;
+    picture_file::write(&file, &png)?;
     let about = thumbnails::about(&folders[0].join("products").join(format!("{product}.npy")));
     Ok(PictureOfDifference {
         file,

@@ -6,10 +6,11 @@ use std::path::{Path, PathBuf};
 use ndarray::{Axis, Ix3};
 use raysweep_processing::ProcessError;
 use raysweep_session::report::{Picture, ToneMap};
-use raysweep_session::{Session, durable, input};
+use raysweep_session::{Session, input};
 use serde_json::{Value, json};
 
 use super::failure::CommandFailure;
+use super::picture_file;
 
 /// Largest picture, in bytes: 4096 x 4096 values and the header of their file.
 const MOST_PICTURE_BYTES: u64 = (4 << 24) + (1 << 16);
@@ -71,7 +72,7 @@ pub(super) fn write(session: &Session, folder: &Path) -> Result<Vec<PathBuf>, Co
     for name in pictures(session) {
         let Some(png) = small(session, &name).map_err(ProcessError::from)? else { continue };
         let path = folder.join(format!("{name}.png"));
-        durable::write(&path, &png).map_err(ProcessError::from)?;
+        picture_file::write(&path, &png)?;
         written.push(path);
     }
     Ok(written)

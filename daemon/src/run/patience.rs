@@ -39,7 +39,10 @@ pub fn write_patiently<T>(
         // Also after `continue`, which makes no room on the disk.
         if orders.now() == Order::Go || !is_told {
             tracing::warn!(%error, "the run waits for the disk");
-            let what = "make room on the disk, or make it writable; the run then goes on by itself";
+            let what = match orders.now() {
+                Order::Pause => "make room on the disk, or make it writable, then continue the paused run",
+                _ => "make room on the disk, or make it writable; the run then goes on by itself",
+            };
             is_told = board.pause_for(Question { text: format!("{error}: {what}"), wants_answer: false });
             if !is_told {
                 return written;
@@ -48,5 +51,44 @@ pub fn write_patiently<T>(
             orders.give(Order::Pause);
         }
         orders.rest(RETRY);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nix::errno::Errno;
+    use raysweep_session::Error;
+
+    use super::*;
+
+    /// What a run that acquires is told when the disk is full once; `pause`: an operator has paused it before.
+    fn told(pause: bool) -> (String, Order) {
+        let (orders, board) = (Orders::default(), StatusBoard::new("plane"));
+        for state in [RunState::Preparing, RunState::Armed, RunState::Running] {
+            board.go(state).unwrap();
+        }
+        if pause {
+            orders.give(Order::Pause);
+            board.go(RunState::Paused).unwrap();
+        }
+        let mut is_full = true;
+        let mut asked = None;
+        write_patiently(&orders, &board, || {
+            asked = asked.take().or(board.status().question);
+            match std::mem::take(&mut is_full) {
+                true => Err(Error::Io { action: "write", path: "x".into(), source: Errno::ENOSPC.into() }),
+                false => Ok(()),
+            }
+        })
+        .unwrap();
+        (asked.unwrap().text, orders.now())
+    }
+
+    #[test]
+    fn a_run_goes_on_by_itself_unless_an_operator_paused_it() {
+        let (text, order) = told(false);
+        assert!(text.contains("goes on by itself") && order == Order::Go, "{text}");
+        let (text, order) = told(true);
+        assert!(text.contains("continue the paused run") && order == Order::Pause, "{text}");
     }
 }

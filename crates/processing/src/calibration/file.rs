@@ -315,7 +315,8 @@ impl KeptCalibration {
         let Some(header) = CalibrationHeader::read(folder)? else { return Ok(None) };
         let path = folder.join("calibration.npz");
         let in_file = |why: String| format!("{}: {why}", path.display());
-        let bytes = input::read(&path, header.most_bytes()).map_err(|error| in_file(io_text(&error)))?;
+        let bytes =
+            input::read_itself(&path, header.most_bytes()).map_err(|error| in_file(io_text(&error)))?;
         if sha256(&bytes) != header.arrays_sha256 {
             return Err(in_file(
                 "its SHA-256 is not the arrays_sha256 of calibration.toml: it was changed or damaged".into(),
@@ -466,12 +467,12 @@ impl CalibrationHeader {
     pub fn read(folder: &Path) -> Result<Option<Self>, String> {
         let path = folder.join("calibration.toml");
         let in_file = |why: String| format!("{}: {why}", path.display());
-        let text = match input::read_text(&path, MAX_HEADER_BYTES) {
-            Ok(text) => text,
+        let bytes = match input::read_itself(&path, MAX_HEADER_BYTES) {
+            Ok(bytes) => bytes,
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
             Err(error) => return Err(in_file(io_text(&error))),
         };
-        let header: Self = toml::from_str(&text).map_err(|error| in_file(error.to_string()))?;
+        let header: Self = toml::from_slice(&bytes).map_err(|error| in_file(error.to_string()))?;
         if header.schema != SCHEMA {
             let schema = header.schema;
             return Err(in_file(format!("schema = {schema}: this version reads {SCHEMA}; calibrate again")));

@@ -355,13 +355,13 @@ impl MatFile {
 fn archive(dir: &Path, to: &Path, accept_damage: bool, scope: ExportScope) -> Result<usize, ProcessError> {
     super::check_new(&Session::open(dir)?, to, "file")?;
     let mut name = to.file_name().unwrap_or_default().to_owned();
-    name.push(".partial");
-    let folder = to.with_file_name(name);
-    let files = super::export(dir, &folder, accept_damage, scope)?;
-    let zipped = durable::write_with(to, |file| zip_folder(&folder, file));
-    let removed = std::fs::remove_dir_all(&folder).map_err(not_copied(&folder));
-    zipped?;
-    removed.map(|()| files)
+    name.push(".content");
+    durable::with_scratch_dir(&to.with_file_name(name), |scratch| {
+        let folder = scratch.join("session");
+        let files = super::export(dir, &folder, accept_damage, scope)?;
+        durable::write_with(to, |file| zip_folder(&folder, file))?;
+        Ok(files)
+    })
 }
 
 fn zip_folder(folder: &Path, to: &mut File) -> io::Result<()> {

@@ -36,9 +36,25 @@ enum Item {
     Problem(String),
 }
 
+/// The way to the writer.
+#[derive(Clone)]
+struct Outbox {
+    items: SyncSender<Item>,
+    orders: Arc<Orders>,
+}
+
+impl Outbox {
+    /// Hands over an item. A writer that is gone has panicked, which its join reports: the mirror need not play on.
+    fn send(&self, item: Item) {
+        if self.items.send(item).is_err() {
+            self.orders.give(Order::Fault);
+        }
+    }
+}
+
 /// Handle of the writer's thread.
 pub struct BatchSink {
-    items: SyncSender<Item>,
+    outbox: Outbox,
     thread: JoinHandle<BatchWriter>,
 }
 
@@ -85,32 +101,33 @@ impl BatchSink {
         let (items, inbox) = sync_channel(WAITING_BATCHES);
         let planned = writing.task.batches.total();
         let progress = ProgressMeter::new(&writing.orders, 0, planned);
+        let outbox = Outbox { items, orders: writing.orders.clone() };
         let writer = BatchWriter { writing, progress, first_ns: None, problems: Vec::new(), error: None };
         let thread = thread::Builder::new()
             .name("dots-writer".into())
             .spawn(move || writer.run(&inbox))
             .map_err(|source| PipelineError::Spawn { name: "dots-writer", source: source.into() })?;
-        Ok(Self { items, thread })
+        Ok(Self { outbox, thread })
     }
 
     /// The sink of a pass whose first batch has this index; raw frames go to `raw`, if given.
     pub fn sink(&self, first_batch: usize, plane: Option<usize>, raw: Option<RawSink>) -> PassSink {
-        PassSink { items: self.items.clone(), first_batch, plane, raw }
+        PassSink { outbox: self.outbox.clone(), first_batch, plane, raw }
     }
 
     /// Records frames that belong to no batch.
     pub fn outside(&self, counts: Counts) {
-        let _ = self.items.send(Item::Outside(counts));
+        self.outbox.send(Item::Outside(counts));
     }
 
     /// Records an entry that no batch depends on.
     pub fn note(&self, entry: Entry) {
-        let _ = self.items.send(Item::Note(entry));
+        self.outbox.send(Item::Note(entry));
     }
 
     /// Notes what the results may suffer from.
     pub fn problem(&self, problem: String) {
-        let _ = self.items.send(Item::Problem(problem));
+        self.outbox.send(Item::Problem(problem));
     }
 
     /// Waits until everything is written.
@@ -118,7 +135,7 @@ impl BatchSink {
     /// # Errors
     /// When the writer panicked.
     pub fn finish(self) -> Result<StoredBatches, PipelineError> {
-        drop(self.items);
+        drop(self.outbox);
         let BatchWriter { writing, problems, error, .. } =
             self.thread.join().map_err(|_panic| PipelineError::Panicked("dots-writer"))?;
         Ok(StoredBatches { ledger: writing.ledger, problems, error })
@@ -127,7 +144,7 @@ impl BatchSink {
 
 /// Receives a pass' batches from the pipeline.
 pub struct PassSink {
-    items: SyncSender<Item>,
+    outbox: Outbox,
     first_batch: usize,
     plane: Option<usize>,
     raw: Option<RawSink>,
@@ -190,12 +207,11 @@ impl PassSink {
 impl CutSink for PassSink {
     fn take(&mut self, cut: Cut) {
         let batch = self.first_batch + cut.batch as usize;
-        // The writer outlives the pass, or has panicked, which its join reports.
-        let _ = self.items.send(Item::Batch(Box::new(cut), batch, self.plane));
+        self.outbox.send(Item::Batch(Box::new(cut), batch, self.plane));
     }
 
     fn outside(&mut self, counts: Counts) {
-        let _ = self.items.send(Item::Outside(counts));
+        self.outbox.send(Item::Outside(counts));
     }
 
     fn frame(&mut self, frame: &Frame) {
@@ -320,5 +336,23 @@ impl BatchWriter {
             tracing::error!(%error, "ledger not written");
             self.fail(error);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_without_its_writer_ends() {
+        let (items, inbox) = sync_channel(WAITING_BATCHES);
+        let orders = Arc::new(Orders::default());
+        let outbox = Outbox { items, orders: orders.clone() };
+        let mut sink = PassSink { outbox, first_batch: 0, plane: None, raw: None };
+        sink.outside(Counts::default());
+        assert_eq!(orders.now(), Order::Go);
+        drop(inbox);
+        sink.outside(Counts::default());
+        assert_eq!(orders.now(), Order::Fault);
     }
 }
