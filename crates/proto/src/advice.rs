@@ -8,6 +8,8 @@ use serde::{Deserialize, Serialize};
 pub struct PlanAdvice {
     /// Noise of the camera.
     pub noise: NoiseEstimate,
+    /// How well the rig is taken to be known.
+    pub rig: RigAccuracy,
     /// The prior, with its weights. If the plan does not choose one, the default.
     pub prior: String,
     /// Expected error of the plan's settings.
@@ -15,6 +17,22 @@ pub struct PlanAdvice {
     /// Settings with no more frames and no longer duration, whose expected error is at least 10 % smaller; `None` if
     /// none were found.
     pub better: Option<BetterPlan>,
+}
+
+/// How well a prediction takes the rig to be known: standard deviations.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct RigAccuracy {
+    /// Whether the calibration in use says so; otherwise it is what a calibration would give, and the rig file's numbers
+    /// are taken for true.
+    pub calibrated: bool,
+    /// Error that the times of all frames share.
+    pub latency_us: f64,
+    /// Error of the time of a single frame.
+    pub edge_us: f64,
+    /// What exposures are longer or shorter than nominal.
+    pub exposure_us: f64,
+    /// Distance of direct light from the pixel's place, in projector rows.
+    pub place_rows: f64,
 }
 
 /// Noise of one frame. Light is in white units: 1 is the light that a white pixel receives from its own row.

@@ -13,7 +13,8 @@ mod rpc;
 mod viewfinder;
 
 pub use advice::{
-    BetterPlan, DesignParams, DesignReport, ErrorRange, ExpectedError, NoiseEstimate, NoiseSource, PlanAdvice,
+    BetterPlan, DesignParams, DesignReport, ErrorRange, ExpectedError, NoiseEstimate, NoiseSource,
+    PlanAdvice, RigAccuracy,
 };
 pub use client::{Client, ClientError, Subscription};
 pub use doctor::{DoctorCheck, DoctorParams, DoctorReport, Grade};

@@ -8,7 +8,7 @@ use raysweep_core::{ClockQuality, FilmSummary, Percentiles, PointUnderWay, Setti
 use raysweep_drivers::mirror::Parked;
 use raysweep_proto::{
     BetterPlan, CheckReport, Description, DesignReport, ErrorRange, ExpectedError, MirrorStatus, NoiseSource,
-    PlanAdvice, Progress, Role, RunState, SessionInfo, Status,
+    PlanAdvice, Progress, RigAccuracy, Role, RunState, SessionInfo, Status,
 };
 
 use super::printer::printable;
@@ -215,7 +215,7 @@ pub(super) fn check(report: &CheckReport) -> String {
 
 /// Expected errors and advice of `check`; the better settings' tables follow the rows.
 fn advice(advice: &PlanAdvice) -> Vec<(&'static str, String)> {
-    let PlanAdvice { noise, prior, expected, better } = advice;
+    let PlanAdvice { rig, noise, prior, expected, better } = advice;
     let source = match noise.source {
         NoiseSource::Calibrated => "as the calibration measured it",
         NoiseSource::Stated => "as the rig file states it",
@@ -234,10 +234,23 @@ fn advice(advice: &PlanAdvice) -> Vec<(&'static str, String)> {
         },
     );
     vec![
+        ("rig", accuracy(rig)),
         ("noise", format!("{dark} in the dark, {shot} of a white pixel's row, which is 1; {source}")),
         ("error", format!("{}, expected with the prior {prior}", errors(expected))),
         ("better", better),
     ]
+}
+
+/// How well the rig is taken to be known.
+fn accuracy(RigAccuracy { calibrated, latency_us, edge_us, place_rows, .. }: &RigAccuracy) -> String {
+    let source = match calibrated {
+        true => "as calibrated",
+        false => {
+            "taken for true: without a calibration nobody knows, and errors may be many times larger; `raysweep calibrate`"
+        }
+    };
+    let [latency_us, edge_us, place_rows] = [latency_us, edge_us, place_rows].map(|value| short(*value));
+    format!("latency to {latency_us} us, edges to {edge_us} us, places to {place_rows} row, {source}")
 }
 
 /// For which scenes the proposed settings are better, if not for both those that count: proposals are ranked by the

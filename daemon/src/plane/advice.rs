@@ -7,7 +7,7 @@ use raysweep_pipeline::{DemuxFold, Point, PointRole, SpotCut, prior_name};
 use raysweep_processing::plane::PlaneTask;
 use raysweep_proto::{
     BetterPlan, DesignParams, DesignReport, ErrorCode, ErrorRange, ExpectedError, NoiseEstimate, NoiseSource,
-    PlanAdvice, RpcError,
+    PlanAdvice, RigAccuracy, RpcError,
 };
 use raysweep_transport::plane::advice::{
     Arrangement, Calibrated, Conditions, Design, Noise, PredictedError, Proposal, Search, Spread, Usable,
@@ -147,7 +147,10 @@ pub fn advise<T: Searched>(
         NoiseOrigin::Simulated => NoiseSource::Simulated,
         NoiseOrigin::Assumed => NoiseSource::Assumed,
     };
+    let Calibrated { latency_us, edge_us, exposure_us, place_rows } = known(planned);
+    let calibrated = planned.task().geometry.calibration.is_some();
     Ok(PlanAdvice {
+        rig: RigAccuracy { calibrated, latency_us, edge_us, exposure_us, place_rows },
         noise: NoiseEstimate { dark: read, shot: gain.sqrt(), source },
         prior: prior_name(adviser.demux.prior()),
         expected: told(&advice.expected),
@@ -206,9 +209,15 @@ pub fn design<T: Searched>(
         light_s: other.periods(camera) as f64 * period_s,
         expected: told(&foreseen),
         plan: other.to_toml(),
-        warnings: warnings(&foreseen, params.error, edge_us),
+        warnings: warnings(&foreseen, params.error, edge_us)
+            .into_iter()
+            .chain(planned.task().geometry.calibration.is_none().then(|| UNCALIBRATED.to_owned()))
+            .collect(),
     })
 }
+
+/// What a design for a rig without a calibration is good for.
+const UNCALIBRATED: &str = "the rig is not calibrated: the error is that of a rig whose file is true to a fraction of a microsecond and of a row; run `raysweep calibrate` first";
 
 /// Fewer frames that are tried where those of the wanted time do not fit.
 const SPARED_FRAMES: usize = 3;

@@ -11,8 +11,8 @@ use raysweep_core::{Counts, LossCause, PointUnderWay, VsyncStats};
 use raysweep_proto::{
     BetterPlan, CalibrationInfo, CheckReport, Client, DesignParams, DesignReport, DoctorCheck, DoctorParams,
     DoctorReport, ErrorCode, ErrorRange, Event, ExpectedError, Grade, MirrorStatus, NoiseEstimate,
-    NoiseSource, PlanAdvice, Progress, Question, ResumeParams, RpcError, RunParams, RunState, SessionInfo,
-    Started, Status, ViewfinderParams,
+    NoiseSource, PlanAdvice, Progress, Question, ResumeParams, RigAccuracy, RpcError, RunParams, RunState,
+    SessionInfo, Started, Status, ViewfinderParams,
 };
 use tokio::runtime::Runtime;
 use tokio::sync::{broadcast, oneshot};
@@ -163,6 +163,13 @@ pub fn report() -> CheckReport {
         reach_rows: Some((-94, 94)),
         condition: Some(1234.5),
         advice: Some(PlanAdvice {
+            rig: RigAccuracy {
+                calibrated: false,
+                latency_us: 0.3,
+                edge_us: 0.5,
+                exposure_us: 0.1,
+                place_rows: 0.02,
+            },
             noise: NoiseEstimate { dark: 0.002, shot: 0.0155, source: NoiseSource::Assumed },
             prior: "split".into(),
             expected,

@@ -444,10 +444,12 @@ impl CalibratedAmbient {
             }
             None => "none".into(),
         };
+        // Noise makes either negative in the dark.
+        let [level, black] = [self.level, self.projector_black].map(|light| light.max(0.0));
         vec![
-            ("ambient light", format!("{:.6} of white in the time of a row", self.level)),
+            ("ambient light", format!("{level:.6} of white in the time of a row")),
             ("flicker", flicker),
-            ("projector's black", format!("{:.5} of white", self.projector_black)),
+            ("projector's black", format!("{black:.5} of white")),
         ]
     }
 
