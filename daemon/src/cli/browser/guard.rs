@@ -40,8 +40,16 @@ impl Guard {
             .get_all(header::ORIGIN)
             .iter()
             .any(|origin| !hosts.iter().any(|host| origin.as_bytes() == format!("http://{host}").as_bytes()));
-        is_foreign.then_some("pages of other addresses may not use this one")
+        (is_foreign || is_embedded(headers)).then_some("pages of other addresses may not use this one")
     }
+}
+
+/// Whether a page of another address asks, as browsers say also where they state no origin. A link to the page, which a
+/// user follows, is none.
+fn is_embedded(headers: &HeaderMap) -> bool {
+    let says = |name: &str, value: &str| headers.get_all(name).iter().any(|said| said == value);
+    let is_link = says("sec-fetch-mode", "navigate") && says("sec-fetch-dest", "document");
+    (says("sec-fetch-site", "cross-site") || says("sec-fetch-site", "same-site")) && !is_link
 }
 
 /// Compares in a time that does not depend on where they differ.
@@ -100,5 +108,28 @@ mod tests {
             headers.append(name, host);
         }
         assert!(guard.refusal("/0123abcd/", &headers).is_some(), "two hosts");
+    }
+
+    #[test]
+    fn what_other_pages_embed_is_refused_and_a_link_is_not() {
+        let guard = Guard { token: "0123abcd".into(), port: 8000 };
+        for (site, mode, dest, is_let_in) in [
+            ("same-origin", "cors", "empty", true),
+            ("none", "navigate", "document", true),
+            ("cross-site", "navigate", "document", true),
+            ("cross-site", "navigate", "iframe", false),
+            ("cross-site", "no-cors", "image", false),
+            ("same-site", "no-cors", "script", false),
+        ] {
+            let mut headers = HeaderMap::new();
+            headers.insert(header::HOST, "127.0.0.1:8000".parse().unwrap());
+            for (name, value) in
+                [("sec-fetch-site", site), ("sec-fetch-mode", mode), ("sec-fetch-dest", dest)]
+            {
+                headers.insert(name, value.parse().unwrap());
+            }
+            let refusal = guard.refusal("/0123abcd/pictures/epipolar", &headers);
+            assert_eq!(refusal.is_none(), is_let_in, "{site} {mode} {dest}");
+        }
     }
 }
