@@ -499,6 +499,19 @@ fn a_resumed_run_does_not_end_with_the_client_that_began_the_session() {
 }
 
 #[test]
+fn a_viewfinder_ends_when_its_client_is_stopped_and_takes_no_events_any_more() {
+    let program = Program::start(PLANE);
+    let mut client = Client::connect(program.folder.path().join("socket")).unwrap();
+    let mut command = program.command(&["viewfinder"]);
+    let viewfinder = process::Process::start(command.stdout(Stdio::null()).stderr(Stdio::null()));
+    process::wait_for("a picture", || client.status().unwrap().viewfinder);
+    viewfinder.signal(Signal::SIGSTOP);
+    let began = std::time::Instant::now();
+    process::wait_for("its end", || (client.status().unwrap().state == RunState::Idle).then_some(()));
+    println!("ended after {:?}", began.elapsed());
+}
+
+#[test]
 fn a_viewfinder_ends_when_its_client_is_killed_unless_it_was_detached() {
     let program = Program::start(PLANE);
     let mut client = Client::connect(program.folder.path().join("socket")).unwrap();

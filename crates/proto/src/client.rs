@@ -1,10 +1,11 @@
 //! A small blocking client.
 
+use std::collections::VecDeque;
 use std::io::{self, BufRead, BufReader, ErrorKind, Write};
 use std::os::unix::fs::MetadataExt;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use nix::unistd::{Gid, Group};
 use raysweep_core::io_text;
@@ -89,6 +90,8 @@ pub struct Client {
     /// The part of a line that was received before a timeout.
     partial: Vec<u8>,
     next_id: u64,
+    /// Events that came before an answer; `None` before a subscription.
+    events: Option<VecDeque<Event>>,
 }
 
 impl Client {
@@ -99,7 +102,10 @@ impl Client {
     pub fn connect(path: impl AsRef<Path>) -> Result<Self, ClientError> {
         let path = path.as_ref().to_owned();
         match UnixStream::connect(&path) {
-            Ok(stream) => Ok(Self { path, stream: BufReader::new(stream), partial: Vec::new(), next_id: 1 }),
+            Ok(stream) => {
+                let stream = BufReader::new(stream);
+                Ok(Self { path, stream, partial: Vec::new(), next_id: 1, events: None })
+            }
             Err(source) => Err(match source.kind() {
                 ErrorKind::NotFound | ErrorKind::ConnectionRefused => {
                     ClientError::NotRunning { path, source }
@@ -233,11 +239,12 @@ impl Client {
         self.call(Method::Viewfinder, params).map(|Empty {}| ())
     }
 
-    /// Streams all events from now on. The connection then carries nothing else; open another one for calls.
+    /// Streams all events from now on. Calls on the same connection go through [`Subscription::client`].
     ///
     /// # Errors
     /// As [`Client::describe`].
     pub fn subscribe(mut self) -> Result<Subscription, ClientError> {
+        self.events = Some(VecDeque::new());
         let Empty {} = self.call(Method::Subscribe, &Empty {})?;
         Ok(Subscription { client: self })
     }
@@ -258,14 +265,26 @@ impl Client {
             _ => Map::new(),
         };
         self.send(&Request::new(id, method.name(), params))?;
-        let Some(incoming) = self.receive(Some(ANSWER_TIMEOUT))? else {
-            let after = ANSWER_TIMEOUT;
-            return Err(ClientError::Timeout { path: self.path.clone(), method: method.name(), after });
-        };
-        let Incoming::Response(response) = incoming else {
-            return Err(
-                self.protocol(format!("it sent an event instead of the answer to `{}`", method.name()))
-            );
+        let asked = Instant::now();
+        let response = loop {
+            // A timeout of zero would be none.
+            let left = ANSWER_TIMEOUT.saturating_sub(asked.elapsed()).max(Duration::from_millis(1));
+            match (self.receive(Some(left))?, &mut self.events) {
+                (Some(Incoming::Response(response)), _) => break response,
+                (Some(Incoming::Event(notice)), Some(events)) if asked.elapsed() < ANSWER_TIMEOUT => {
+                    events.push_back(notice.params);
+                }
+                (Some(Incoming::Event(_)), None) => {
+                    let method = method.name();
+                    return Err(
+                        self.protocol(format!("it sent an event instead of the answer to `{method}`"))
+                    );
+                }
+                (None | Some(Incoming::Event(_)), _) => {
+                    let (path, method) = (self.path.clone(), method.name());
+                    return Err(ClientError::Timeout { path, method, after: ANSWER_TIMEOUT });
+                }
+            }
         };
         match response.outcome {
             // An error without an id concerns the connection: too many clients, or a line that is too long.
@@ -329,6 +348,11 @@ pub struct Subscription {
 }
 
 impl Subscription {
+    /// The connection, for calls. A run that is attached to it ends when nobody receives its events any more.
+    pub fn client(&mut self) -> &mut Client {
+        &mut self.client
+    }
+
     /// The next event, or `None` if none arrived within `timeout`, which must not be zero.
     ///
     /// # Errors
@@ -338,6 +362,9 @@ impl Subscription {
     }
 
     fn receive(&mut self, timeout: Option<Duration>) -> Result<Option<Event>, ClientError> {
+        if let Some(event) = self.client.events.as_mut().and_then(VecDeque::pop_front) {
+            return Ok(Some(event));
+        }
         match self.client.receive(timeout)? {
             Some(Incoming::Event(notice)) => Ok(Some(notice.params)),
             Some(Incoming::Response(response)) => match response.outcome {
@@ -383,7 +410,7 @@ mod tests {
     use std::thread;
 
     use super::*;
-    use crate::ErrorCode;
+    use crate::{ErrorCode, EventNotice};
 
     /// A daemon that reads one line, sends `answer` verbatim, and closes the connection.
     fn peer(answer: &'static str) -> (tempfile::TempDir, PathBuf, thread::JoinHandle<String>) {
@@ -463,6 +490,21 @@ mod tests {
             assert!(format!("{error:?}").starts_with(wanted), "{answer:?}: {error:?}");
             peer.join().unwrap();
         }
+    }
+
+    #[test]
+    fn events_that_come_before_an_answer_are_kept() {
+        let event = serde_json::to_string(&EventNotice::new(Event::Skipped { events: 3 })).unwrap();
+        let subscribed = r#"{"jsonrpc":"2.0","id":1,"result":{}}"#;
+        let answer = r#"{"jsonrpc":"2.0","id":2,"result":{}}"#;
+        let lines = format!("{subscribed}\n{event}\n{answer}\n{event}\n");
+        let (_folder, path, peer) = peer(Box::leak(lines.into_boxed_str()));
+        let mut events = Client::connect(path).unwrap().subscribe().unwrap();
+        events.client().pause().unwrap();
+        for _ in 0..2 {
+            assert_eq!(events.next().unwrap().unwrap(), Event::Skipped { events: 3 });
+        }
+        peer.join().unwrap();
     }
 
     #[test]

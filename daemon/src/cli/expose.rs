@@ -152,10 +152,14 @@ struct Trial {
 
 impl Trial {
     fn begin(socket: &Path) -> Result<Self, CommandFailure> {
-        let events = Client::connect(socket)?.subscribe()?;
+        let mut events = Client::connect(socket)?.subscribe()?;
         let interrupts = Interrupts::of_any_end().map_err(CommandFailure::Signals)?;
-        let mut client = Client::connect(socket)?;
-        client.run(&RunParams { plan: VIEWFINDER.into(), attached: true, ..RunParams::default() })?;
+        let client = Client::connect(socket)?;
+        events.client().run(&RunParams {
+            plan: VIEWFINDER.into(),
+            attached: true,
+            ..RunParams::default()
+        })?;
         let mut trial = Self { client, events, interrupts, pictures: 0 };
         trial.picture(None)?;
         Ok(trial)

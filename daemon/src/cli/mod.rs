@@ -364,9 +364,10 @@ fn begin_run(
         return Ok(Exit::Done);
     }
     // Before the run begins, so that none of its events is missed, and no Ctrl-C ends us with the run unattended.
-    let events = Client::connect(socket)?.subscribe()?;
+    let mut events = Client::connect(socket)?.subscribe()?;
     let mut interrupts = interrupts().map_err(CommandFailure::Signals)?;
-    let Started { session } = begin(&mut client)?;
+    // On the connection that takes the events: what is attached to it also ends with a client that was stopped.
+    let Started { session } = begin(events.client())?;
     let mut view = EventView::new(printer);
     follow(events, &session, &mut interrupts, &mut view, OnInterrupt::Cancel(client))
 }
