@@ -43,6 +43,8 @@ pub struct ImageSensor {
     black_dn: f32,
     /// By how much each count of a signal lowers it, relative to itself.
     compression_per_dn: f32,
+    /// The signal at which counts are highest.
+    most_signal_dn: f32,
     /// Distance between neighbouring converter codes, in counts.
     step_dn: f32,
     max_dn: f32,
@@ -82,6 +84,7 @@ impl ImageSensor {
         }
         let step_dn = 2_f32.powi(scale.bits.saturating_sub(config.adc_bits.max(1)) as i32);
         let max_dn = 2_f32.powi(scale.bits as i32) - step_dn;
+        let compression_per_dn = config.compression_percent as f32 / 100.0 / (max_dn - scale.black_dn as f32);
         Self {
             config: config.clone(),
             seed,
@@ -93,7 +96,8 @@ impl ImageSensor {
             black_dn: scale.black_dn as f32,
             step_dn,
             max_dn,
-            compression_per_dn: config.compression_percent as f32 / 100.0 / (max_dn - scale.black_dn as f32),
+            compression_per_dn,
+            most_signal_dn: 0.5 / compression_per_dn,
         }
     }
 
@@ -119,7 +123,8 @@ impl ImageSensor {
                         electrons += variance.sqrt() * z;
                     }
                     let electrons = (electrons + offsets[s]).min(self.config.full_well_e as f32);
-                    let signal_dn = electrons / self.electrons_per_dn;
+                    // Beyond the parabola's peak, counts would fall again.
+                    let signal_dn = (electrons / self.electrons_per_dn).min(self.most_signal_dn);
                     let level = self.black_dn + signal_dn * (1.0 - self.compression_per_dn * signal_dn);
                     *count = ((level / self.step_dn).round() * self.step_dn).clamp(0.0, self.max_dn) as u16;
                 }

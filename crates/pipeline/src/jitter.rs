@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2, s};
 use rayon::prelude::*;
+use raysweep_transport::plane::board::CameraCurve;
 use raysweep_transport::plane::board::times::{JitterGauge, Lateness};
 use raysweep_transport::plane::{PlaneError, Setting};
 
@@ -59,7 +60,11 @@ impl StripGauge {
         let centre_us = raster.row_centre_us(geometry.first_row);
         let gauge = JitterGauge::new(calibration, strip, raster.period_us, centre_us)?;
         let white_dn = calibration.white_dn.slice(s![.., gauge.columns()]).mapv(f64::from);
-        let scale = LightScale::new(&white_dn, calibration.linearity_per_dn);
+        let curve = calibration.curve.as_ref().map(|CameraCurve { per_dn, zero_dn }| CameraCurve {
+            per_dn: *per_dn,
+            zero_dn: zero_dn.slice(s![.., gauge.columns()]).to_owned(),
+        });
+        let scale = LightScale::new(&white_dn, curve);
         Ok(Some(Self { gauge: Arc::new(gauge), scale: Arc::new(scale), jitter_us: strip.jitter_us }))
     }
 

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use ndarray::{Array2, Axis};
 use raysweep_core::{CameraSettings, Raster, Shutter};
-use raysweep_transport::plane::board::BoardCalibration;
+use raysweep_transport::plane::board::{BoardCalibration, CameraCurve};
 use raysweep_transport::plane::calibrate::{self, FlyingSpot};
 use raysweep_transport::plane::{Beam, CameraRows, PlaneError, RowTiming, Setting};
 use serde::Deserialize;
@@ -187,8 +187,12 @@ impl SweepGeometry {
 
     /// What converts the counts of these camera rows to light.
     pub fn scale_of(&self, rows: &[usize]) -> LightScale {
-        let linearity_per_dn = self.calibration.as_ref().map_or(0.0, |found| found.linearity_per_dn);
-        LightScale::new(&self.white_of(rows), linearity_per_dn)
+        let curve = self.calibration.as_ref().and_then(|calibration| calibration.curve.as_ref());
+        let curve = curve.map(|CameraCurve { per_dn, zero_dn }| CameraCurve {
+            per_dn: *per_dn,
+            zero_dn: zero_dn.select(Axis(0), rows),
+        });
+        LightScale::new(&self.white_of(rows), curve)
     }
 
     /// The timing of projector and camera rows for the model. An unknown beam counts as ideal.

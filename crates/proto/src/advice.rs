@@ -29,7 +29,7 @@ pub struct RigAccuracy {
     pub latency_us: f64,
     /// Error of the time of a single frame.
     pub edge_us: f64,
-    /// What exposures are longer or shorter than nominal.
+    /// Error of the length of exposures.
     pub exposure_us: f64,
     /// Distance of direct light from the pixel's place, in projector rows.
     pub place_rows: f64,

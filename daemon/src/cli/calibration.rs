@@ -1,5 +1,6 @@
 //! `raysweep calibration`: show, list, choose and compare calibrations.
 
+use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
@@ -180,9 +181,11 @@ impl Comparison {
                 second.header.valid_for.projector_rows
             )));
         }
-        let pairs = figures(&first.header).into_iter().zip(figures(&second.header));
-        let figures =
-            pairs.map(|((name, [a, a_sd]), (_, [b, b_sd]))| (name, a, b, (b - a) / a_sd.hypot(b_sd)));
+        let of_second: BTreeMap<&str, Pair> = figures(&second.header).into_iter().collect();
+        let figures = figures(&first.header).into_iter().filter_map(|(name, [a, a_sd])| {
+            let [b, b_sd] = of_second.get(name)?;
+            Some((name, a, *b, (b - a) / a_sd.hypot(*b_sd)))
+        });
         let seen = |kept: &KeptCalibration| kept.header.timing.seen_rows;
         let rows = seen(first)[0].max(seen(second)[0])..seen(first)[1].min(seen(second)[1]);
         let differences: Vec<f64> =

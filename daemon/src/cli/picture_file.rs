@@ -1,7 +1,7 @@
 //! The PNG files that commands write where a user says.
 
 use std::fs::{self, File};
-use std::io::Read;
+use std::io::{self, Read};
 use std::path::Path;
 
 use raysweep_processing::ProcessError;
@@ -18,14 +18,16 @@ pub(super) fn check(file: &Path) -> Result<(), CommandFailure> {
     if !file.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("png")) {
         return Err(CommandFailure::NotPng(file.to_owned()));
     }
-    let is_new =
-        matches!(fs::symlink_metadata(file), Err(error) if error.kind() == std::io::ErrorKind::NotFound);
-    if !is_new && !is_picture(file) {
-        return Err(CommandFailure::OtherFile(file.to_owned()));
+    match fs::symlink_metadata(file) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+        Err(source) => return Err(CommandFailure::Write { path: file.to_owned(), source }),
+        Ok(_) if is_picture(file) => {}
+        Ok(_) => return Err(CommandFailure::OtherFile(file.to_owned())),
     }
-    let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let in_session = fs::canonicalize(folder)
-        .is_ok_and(|folder| folder.ancestors().any(|above| above.join("ledger.jsonl").exists()));
+    // The folder may have to be made: that above it which exists decides.
+    let above = file.ancestors().skip(1).find_map(|folder| fs::canonicalize(folder).ok());
+    let above = above.or_else(|| fs::canonicalize(".").ok()).unwrap_or_default();
+    let in_session = above.ancestors().any(|folder| folder.join("ledger.jsonl").exists());
     match in_session {
         true => Err(CommandFailure::InSession(file.to_owned())),
         false => Ok(()),
@@ -67,6 +69,7 @@ mod tests {
         fs::create_dir_all(&products).unwrap();
         fs::write(at("session/ledger.jsonl"), "").unwrap();
         assert!(refusal(&products.join("new.png")).contains("a session"));
+        assert!(refusal(&products.join("folder/that/is/not/there/new.png")).contains("a session"));
         assert_eq!(fs::read(at("notes.png")).unwrap(), b"not a picture");
     }
 }

@@ -1,8 +1,7 @@
 //! `preview`: the live images as a picture.
 
-use std::fs;
 use std::io::{self, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::thread;
 use std::time::Duration;
 
@@ -46,7 +45,7 @@ pub(super) fn preview(
         let mut is_last = was_under_way && !is_under_way;
         if let Some((picture, image)) = newest.filter(|(_, image)| drawn != Some(image.sequence)) {
             let first = drawn.replace(image.sequence).is_none();
-            replace(output, &picture)?;
+            picture_file::write(output, &picture)?;
             tell(&image, output, printer)?;
             // The first image may be the result of an earlier run.
             is_last |= !first && image.metadata.get("last") == Some(&Value::Bool(true));
@@ -103,15 +102,6 @@ fn side_by_side(epipolar: LiveImage, indirect: &LiveImage) -> Result<Vec<u8>, Co
 fn png(image: &Array2<f32>) -> Result<Vec<u8>, CommandFailure> {
     let picture = Picture::grey(image.view(), ToneMap { white: 1.0 });
     Ok(picture.to_png().map_err(raysweep_processing::ProcessError::from)?)
-}
-
-/// Replaces the file atomically, so that a viewer never sees half an image.
-fn replace(output: &Path, png: &[u8]) -> Result<(), CommandFailure> {
-    let failed = |source| CommandFailure::Write { path: output.to_owned(), source };
-    let mut name = output.as_os_str().to_owned();
-    name.push(".part");
-    let part = PathBuf::from(name);
-    fs::write(&part, png).and_then(|()| fs::rename(&part, output)).map_err(failed)
 }
 
 fn tell(image: &LiveImage, output: &Path, printer: Printer) -> Result<(), CommandFailure> {

@@ -246,7 +246,7 @@ fn accuracy(RigAccuracy { calibrated, latency_us, edge_us, place_rows, .. }: &Ri
     let source = match calibrated {
         true => "as calibrated",
         false => {
-            "taken for true: without a calibration nobody knows, and errors may be many times larger; `raysweep calibrate`"
+            "assumed, because the rig is not calibrated: errors may be many times larger; run `raysweep calibrate`"
         }
     };
     let [latency_us, edge_us, place_rows] = [latency_us, edge_us, place_rows].map(|value| short(*value));

@@ -39,8 +39,7 @@ pub(super) fn pictures(session: &Session) -> Vec<String> {
 
 /// What is known of a product; null if nothing is.
 pub(super) fn about(product: &Path) -> Value {
-    let text = input::open_itself(&product.with_extension("json"), MOST_ABOUT_BYTES);
-    let text = text.and_then(|file| input::read_open(&file, MOST_ABOUT_BYTES)).ok();
+    let text = input::read_itself(&product.with_extension("json"), MOST_ABOUT_BYTES).ok();
     text.and_then(|text| serde_json::from_slice(&text).ok()).unwrap_or_default()
 }
 
@@ -67,6 +66,8 @@ pub(super) fn small(session: &Session, name: &str) -> raysweep_session::Result<O
 
 /// Writes a small PNG file of each picture of a session into `folder`; returns their paths.
 pub(super) fn write(session: &Session, folder: &Path) -> Result<Vec<PathBuf>, CommandFailure> {
+    // Before a folder is made where none is wanted.
+    picture_file::check(&folder.join("picture.png"))?;
     fs::create_dir_all(folder).map_err(|source| CommandFailure::Write { path: folder.to_owned(), source })?;
     let mut written = Vec::new();
     for name in pictures(session) {

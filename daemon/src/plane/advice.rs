@@ -217,7 +217,7 @@ pub fn design<T: Searched>(
 }
 
 /// What a design for a rig without a calibration is good for.
-const UNCALIBRATED: &str = "the rig is not calibrated: the error is that of a rig whose file is true to a fraction of a microsecond and of a row; run `raysweep calibrate` first";
+const UNCALIBRATED: &str = "the rig is not calibrated: the error assumes that its file is right to 0.3 us and 0.02 row; run `raysweep calibrate` first";
 
 /// Fewer frames that are tried where those of the wanted time do not fit.
 const SPARED_FRAMES: usize = 3;

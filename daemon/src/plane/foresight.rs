@@ -105,13 +105,22 @@ impl Model {
         let begin_or_end = "begin or end while the flying spot draws the pixel's own row";
         match &self.cut {
             SpotCut::Nowhere | SpotCut::Modelled { .. } => None,
-            SpotCut::LeftOut { cut } => Some(format!(
-                "{} of {} settings {begin_or_end}, and are left out: state projector.scan, camera.projector_columns and projector.beam_sigma_rows = 0, or move their delays by a row",
-                cut.len(),
-                task.settings().count()
-            )),
+            SpotCut::LeftOut { cut } => {
+                // A measured response and the spot's path are not modelled together.
+                let known = match task.geometry.calibration {
+                    Some(_) => "",
+                    None => {
+                        "state projector.scan, camera.projector_columns and projector.beam_sigma_rows = 0, or "
+                    }
+                };
+                Some(format!(
+                    "{} of {} settings {begin_or_end}, and are left out: {known}move their delays by a row",
+                    cut.len(),
+                    task.settings().count()
+                ))
+            }
             SpotCut::Everywhere => Some(format!(
-                "all settings {begin_or_end}, so direct light is not to be trusted: move delays by a row"
+                "all settings {begin_or_end}, so direct light is not to be trusted: move the delays by a row"
             )),
         }
     }

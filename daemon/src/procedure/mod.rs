@@ -37,7 +37,7 @@ pub fn foresee(lab: &Lab<'_>, text: &str) -> Result<Foreseen, ConfigError> {
             darks::foresee(lab, RigOfRun::of_new(lab, rig), &plan, own)
         }
         (SharedRig::Plane(rig), Procedure::Calibration(own)) => {
-            calibration::foresee(lab, RigOfRun::of_new(lab, rig), &plan, own)
+            calibration::foresee(lab, RigOfRun::of_new(lab, rig), &plan, own, None)
         }
         (SharedRig::Plane(rig), Procedure::Patterns(own)) => {
             patterns::foresee(lab, RigOfRun::of_new(lab, rig).calibrated(lab, &in_use)?, &plan, own)
@@ -103,7 +103,7 @@ pub fn foresee_rest(
             darks::foresee(lab, RigOfRun::of_begun(rig, begun), &plan, own)
         }
         (SharedRig::Plane(rig), Procedure::Calibration(own)) => {
-            calibration::foresee(lab, RigOfRun::of_begun(rig, begun), &plan, own)
+            calibration::foresee(lab, RigOfRun::of_begun(rig, begun), &plan, own, Some(begun.shape.contents))
         }
         (SharedRig::Dots(_), _)
         | (

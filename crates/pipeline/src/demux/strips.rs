@@ -105,7 +105,7 @@ fn not_read(what: String) -> NotSolved {
 mod tests {
     use ndarray::{Array2, concatenate, s};
     use raysweep_core::{Counts, Raster, SettingsId};
-    use raysweep_transport::plane::board::{BoardCalibration, CalibrationCovariance, Estimate};
+    use raysweep_transport::plane::board::{BoardCalibration, CalibrationCovariance, CameraCurve, Estimate};
     use raysweep_transport::plane::{NoiseModel, PixelResponse, RESPONSE_ROWS, Setting};
 
     use super::*;
@@ -273,7 +273,7 @@ mod tests {
             covariance: CalibrationCovariance::independent([0.0; 5]),
             response: PixelResponse::with_beam(places, &shares).unwrap(),
             white_dn,
-            linearity_per_dn: 0.0,
+            curve: Some(CameraCurve { per_dn: 1e-5, zero_dn: Array2::from_elem((HEIGHT, WIDTH), 100.0) }),
             noise: NoiseModel { read_variance: 0.0, gain: 0.0 },
             strip: None,
             lamp: None,

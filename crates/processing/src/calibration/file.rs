@@ -13,7 +13,8 @@ use raysweep_core::{CameraCapabilities, PixelFormat, io_text};
 use raysweep_session::{durable, input};
 use raysweep_transport::plane::board::images::MOST_BEND;
 use raysweep_transport::plane::board::{
-    BoardCalibration, BoardStrip, CalibrationCovariance, CalibrationParameter, Estimate, FlickeringLamp,
+    BoardCalibration, BoardStrip, CalibrationCovariance, CalibrationParameter, CameraCurve, Estimate,
+    FlickeringLamp,
 };
 use raysweep_transport::plane::{NoiseModel, PixelResponse, RESPONSE_ROWS};
 use serde::{Deserialize, Serialize};
@@ -122,8 +123,8 @@ pub struct CalibratedLight {
     pub read_noise_e: Pair,
     /// Non-uniformity of the pixels' sensitivities.
     pub prnu: Pair,
-    /// `a` of the camera's curve: what it counts above the dark image, times `1 + a` of that, is proportional to the
-    /// light; `None` in files of earlier versions, which take the camera as linear.
+    /// `a` of the camera's curve: what it counts above `dark_offset_dn`, times `1 + a` of that, is proportional to the
+    /// light; `None` if it was not measured, and the camera is taken as linear.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub linearity_per_dn: Option<Pair>,
     /// Number of pixels with unusual dark current or noise.
@@ -193,8 +194,8 @@ pub struct KeptCalibration {
     pub arrays: CalibrationArrays,
 }
 
-/// No camera with at least 8 bits is accepted with a larger `a`.
-const MOST_CURVE_PER_DN: f64 = MOST_BEND / 255.0;
+/// No camera with at least 8 bits is calibrated with a larger `a`: its error is part of what is accepted.
+const MOST_CURVE_PER_DN: f64 = 2.0 * MOST_BEND / 255.0;
 
 impl CalibrationArrays {
     fn to_bytes(&self) -> Result<Vec<u8>, String> {
@@ -402,7 +403,11 @@ impl KeptCalibration {
             covariance: self.covariance(),
             response,
             white_dn: self.arrays.white_dn.clone(),
-            linearity_per_dn: self.header.light.linearity_per_dn.map_or(0.0, |[per_dn, _]| per_dn),
+            curve: self
+                .header
+                .light
+                .linearity_per_dn
+                .map(|[per_dn, _]| CameraCurve { per_dn, zero_dn: self.arrays.dark_offset_dn.clone() }),
             noise: NoiseModel { read_variance: (read_noise_e[0] / white_e).powi(2), gain: white_e.recip() },
             strip,
             lamp: self.header.ambient.as_ref().and_then(CalibratedAmbient::lamp),

@@ -14,12 +14,14 @@ use raysweep_transport::plane::board::images::{
 use raysweep_transport::plane::board::times::{BoardFrame, CoarseSweep, Columns, RowTimes, TimesError};
 use raysweep_transport::plane::{NoiseModel, PlaneError};
 
-use super::task::{AMBIENT_US, BoardPurpose, CalibrationTask, ROWS_PER_BLOCK, WHOLE_US};
+use super::task::{AMBIENT_US, BoardPurpose, CalibrationTask, PASSES_GREY, ROWS_PER_BLOCK, WHOLE_US};
 use crate::plane::place;
 
 /// Light of the room, of white in the time of a row, that is not worth subtracting.
 const DARK_ROOM: f64 = 2e-5;
-/// A curve is not used if full scale is known no better than this, relative to itself: lamps that flicker are in it.
+/// Flicker by less than this share of a pass of the beam does not bend the curve.
+const STEADY_SHARE: f64 = 0.001;
+/// A curve is not used if full scale is known no better than this, relative to itself.
 const KNOWN_BEND: f64 = 0.003;
 /// Fewer frames of an exposure do not show the room's light.
 const LEAST_AMBIENT_FRAMES: usize = 8;
@@ -42,6 +44,81 @@ pub enum CalibrationError {
     /// The session cannot be read.
     #[error(transparent)]
     Session(#[from] raysweep_session::Error),
+}
+
+/// What is known of the camera's curve.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum MeasuredCurve {
+    /// It is known.
+    Known(Linearity),
+    /// No images of it were taken.
+    NotTaken,
+    /// Exposures of several periods saturate.
+    Saturated,
+    /// The images say too little of it.
+    Uncertain,
+}
+
+impl MeasuredCurve {
+    /// From exposures with one, two and three passes of the beam.
+    fn of(images: &BoardImages<'_>, dark: &DarkFit, saturation_dn: f32) -> Result<Self, CalibrationError> {
+        let period_us = images.task.task.geometry.raster.period_us;
+        let taken: Vec<(f64, Array3<f32>, Array2<f32>)> = images
+            .task
+            .passes()
+            .map(|(passes, purpose)| {
+                let passes = passes as f64;
+                Ok((passes, images.frames(purpose)?, dark.image(passes * period_us)))
+            })
+            .collect::<Result<_, CalibrationError>>()?;
+        if taken.is_empty() {
+            return Ok(Self::NotTaken);
+        }
+        let levels: Vec<LightLevel<'_>> = taken
+            .iter()
+            .map(|(light, frames, dark_dn)| LightLevel {
+                light: *light,
+                frames: frames.view(),
+                dark_dn: dark_dn.view(),
+            })
+            .collect();
+        let usable = dark.hot.mapv(|hot| !hot);
+        match Linearity::new(&levels, saturation_dn, Some(usable.view())) {
+            Ok(found) if found.per_dn.sd * f64::from(saturation_dn) < KNOWN_BEND => Ok(Self::Known(found)),
+            Ok(_) => Ok(Self::Uncertain),
+            Err(ImagesError::TooFew { .. }) => Ok(Self::Saturated),
+            Err(error) => Err(error.into()),
+        }
+    }
+
+    /// The curve, if it is known.
+    pub fn known(&self) -> Option<&Linearity> {
+        match self {
+            Self::Known(linearity) => Some(linearity),
+            Self::NotTaken | Self::Saturated | Self::Uncertain => None,
+        }
+    }
+
+    /// What is to be said to an operator.
+    pub fn warning(&self) -> Option<&'static str> {
+        match self {
+            Self::Known(_) | Self::NotTaken => None,
+            Self::Saturated => Some(
+                "how linear the camera is could not be measured, and it is taken as linear: exposures of several VSYNC periods saturate; close the aperture until white gives 50 to 65 % of full scale, switch the lamps off, or take calibration.passes = 2",
+            ),
+            Self::Uncertain => Some(
+                "how linear the camera is could not be measured, and it is taken as linear: exposures of several VSYNC periods differ among each other; switch lamps that flicker off",
+            ),
+        }
+    }
+
+    /// Images `[n, t, s]` whose counts are proportional to the light, as far as the curve is known.
+    fn straightened(&self, mut images: Array3<f32>, dark: &DarkFit) -> Array3<f32> {
+        if let Some(linearity) = self.known() {
+            linearity.straighten(images.view_mut(), &dark.offset_dn);
+        }
+        images
+    }
 }
 
 /// The images of a session.
@@ -136,8 +213,8 @@ pub struct BoardPixels {
     pub transfer: PhotonTransfer,
     /// Non-uniformity of the pixels' sensitivities.
     pub prnu: Estimate,
-    /// The camera's curve; `None` if it was not measured, or could not be.
-    pub linearity: Option<Linearity>,
+    /// The camera's curve.
+    pub curve: MeasuredCurve,
     /// White, as all light in counts that are proportional to it.
     pub white: WhiteMap,
     /// The room's light, and the run whose clock its flicker has; `None` if too few of its frames have time stamps of
@@ -158,7 +235,7 @@ impl BoardPixels {
     /// When an image is missing, or board, light or pictures are of no use.
     pub fn new(images: &BoardImages<'_>) -> Result<Self, CalibrationError> {
         let task = images.task;
-        let full_scale_dn = task.task.geometry.saturation_dn as f32;
+        let saturation_dn = task.task.geometry.saturation_dn as f32;
         let dark = dark(images)?;
         let (black, white) = (images.frames(BoardPurpose::Black)?, images.frames(BoardPurpose::White)?);
         let dark_dn = dark.image(WHOLE_US);
@@ -172,26 +249,35 @@ impl BoardPixels {
             .chain([level(1.0, white.view())])
             .collect();
         let usable = dark.hot.mapv(|hot| !hot);
-        let transfer = photon_transfer(&levels, full_scale_dn, Some(usable.view()))?;
+        let transfer = photon_transfer(&levels, saturation_dn, Some(usable.view()))?;
         let noise = transfer.noise();
         let frames = white.len_of(Axis(0));
-        let mut white = WhiteMap::new(white.view(), black.view(), full_scale_dn, noise)?;
-        white.check(full_scale_dn)?;
-        let linearity = linearity(images, &dark, full_scale_dn)?;
-        if let Some(linearity) = &linearity {
-            white = white.straightened(linearity);
-        }
-        let ambient = room(images, &dark, noise)?;
+        // Whether it saturates is seen in what the camera counts.
+        let counted = WhiteMap::new(white.view(), black.view(), saturation_dn, noise)?;
+        counted.check(saturation_dn)?;
+        let room_dn = room(images, &dark, &MeasuredCurve::NotTaken, noise)?;
+        let pass_dn = f64::from(PASSES_GREY) * counted.level_dn.value;
+        let curve = match room_dn.as_ref().is_some_and(|(room, _)| flickers(room, pass_dn)) {
+            true if task.calibration.passes > 0 => MeasuredCurve::Uncertain,
+            _ => MeasuredCurve::of(images, &dark, saturation_dn)?,
+        };
+        let straight = |images| curve.straightened(images, &dark);
+        let (black, white) = (straight(black), straight(white));
+        let white = WhiteMap {
+            saturated: counted.saturated,
+            ..WhiteMap::new(white.view(), black.view(), saturation_dn, noise)?
+        };
+        let ambient = match curve.known() {
+            Some(_) => room(images, &dark, &curve, noise)?,
+            None => room_dn,
+        };
         if let Some((ambient, _)) = &ambient {
             ambient.check(white.level_dn.value, task.task.geometry.raster.row_time_us)?;
         }
         let lit = white.lit();
         let prnu = prnu(white.white_dn.view(), Some(lit.view()), frames, noise)?;
         let black_dn = black.mean_axis(Axis(0)).unwrap_or_default();
-        let mut sparse = images.means(CalibrationTask::phases())? - &black_dn;
-        if let Some(linearity) = &linearity {
-            linearity.straighten(&mut sparse);
-        }
+        let sparse = straight(images.means(CalibrationTask::phases())?) - &black_dn;
         let phases = Phases { images: sparse.view(), frames: task.calibration.picture_frames as usize };
         let coded = images.means(task.codes())?;
         let code = CodedPictures { images: coded.view(), lines_per_block: ROWS_PER_BLOCK };
@@ -200,7 +286,7 @@ impl BoardPixels {
         let responses = Responses::new(&phases, &white, &places, projector_rows)?;
         responses.checks.check()?;
         let columns = Columns::new(responses.place.view(), responses.response.view())?;
-        Ok(Self { dark, transfer, prnu, linearity, white, ambient, places, responses, columns })
+        Ok(Self { dark, transfer, prnu, curve, white, ambient, places, responses, columns })
     }
 
     /// The room's light in an image of a single frame, unless the room is dark.
@@ -232,10 +318,8 @@ impl BoardPixels {
     ) -> Result<Vec<BoardFrame>, CalibrationError> {
         let frame = |ordinal| {
             let (image, entry) = images.image(ordinal)?;
-            let mut light = image - self.dark.image(entry.exposure_us);
-            if let Some(linearity) = &self.linearity {
-                linearity.straighten(&mut light);
-            }
+            let image = self.curve.straightened(image.insert_axis(Axis(0)), &self.dark);
+            let mut light = image.index_axis_move(Axis(0), 0) - self.dark.image(entry.exposure_us);
             if let Some(ambient_dn) = self.ambient_dn(images, purpose, entry) {
                 light -= &ambient_dn;
             }
@@ -273,51 +357,32 @@ impl BoardPixels {
     }
 }
 
-/// The camera's curve, from exposures with one, two and three passes of the beam.
-fn linearity(
-    images: &BoardImages<'_>,
-    dark: &DarkFit,
-    full_scale_dn: f32,
-) -> Result<Option<Linearity>, CalibrationError> {
-    let period_us = images.task.task.geometry.raster.period_us;
-    let taken: Vec<(f64, Array3<f32>, Array2<f32>)> = images
-        .task
-        .passes()
-        .map(|(passes, purpose)| {
-            let passes = passes as f64;
-            Ok((passes, images.frames(purpose)?, dark.image(passes * period_us)))
-        })
-        .collect::<Result<_, CalibrationError>>()?;
-    if taken.is_empty() {
-        return Ok(None);
-    }
-    let levels: Vec<LightLevel<'_>> = taken
-        .iter()
-        .map(|(light, frames, dark_dn)| LightLevel {
-            light: *light,
-            frames: frames.view(),
-            dark_dn: dark_dn.view(),
-        })
-        .collect();
-    let usable = dark.hot.mapv(|hot| !hot);
-    match Linearity::new(&levels, full_scale_dn, Some(usable.view())) {
-        Ok(found) => Ok((found.per_dn.sd * f64::from(full_scale_dn) < KNOWN_BEND).then_some(found)),
-        // In a lit room, exposures of whole periods saturate.
-        Err(ImagesError::TooFew { .. }) => Ok(None),
-        Err(error) => Err(error.into()),
-    }
+/// Whether the room's light flickers by more than a curve is known to, against the light of a pass of the beam: the frames
+/// of whole periods see the same phases again and again, so that their scatter does not show it.
+fn flickers(room: &Ambient, pass_dn: f64) -> bool {
+    let Some(flicker) = &room.flicker else { return false };
+    let mut levels: Vec<f32> =
+        room.level_dn_per_us.iter().copied().filter(|level| level.is_finite()).collect();
+    levels.sort_by(f32::total_cmp);
+    let level = levels.get(levels.len() / 2).map_or(0.0, |&level| f64::from(level));
+    // The integral of a sinusoid over an exposure is at most its amplitude times this.
+    let most_us = 1e6 / (std::f64::consts::PI * flicker.frequency_hz.value);
+    level * flicker.share.value * most_us > STEADY_SHARE * pass_dn
 }
 
 /// The room's light, from the black pictures of both exposures.
 fn room(
     images: &BoardImages<'_>,
     dark: &DarkFit,
+    curve: &MeasuredCurve,
     noise: SensorNoise,
 ) -> Result<Option<(Ambient, u32)>, CalibrationError> {
     let Some(run) = images.run_of_ambient() else { return Ok(None) };
     let exposures = [(BoardPurpose::Black, WHOLE_US), (BoardPurpose::Ambient, AMBIENT_US)];
     let [black, short] = exposures.map(|(purpose, exposure_us)| {
-        Ok::<_, CalibrationError>((images.timed_frames(purpose, run)?, exposure_us, dark.image(exposure_us)))
+        let (frames, opened_s) = images.timed_frames(purpose, run)?;
+        let frames = (curve.straightened(frames, dark), opened_s);
+        Ok::<_, CalibrationError>((frames, exposure_us, dark.image(exposure_us)))
     });
     let taken = [black?, short?];
     if taken.iter().any(|((_, opened_s), ..)| opened_s.len() < LEAST_AMBIENT_FRAMES) {

@@ -21,7 +21,7 @@ pub use self::file::{
     ValidFor, current_in,
 };
 use self::file::{CalibratedLight, CalibratedTiming, SCHEMA};
-pub use self::images::{BoardImages, BoardPixels, CalibrationError};
+pub use self::images::{BoardImages, BoardPixels, CalibrationError, MeasuredCurve};
 pub use self::task::{BoardPurpose, BoardView, CalibrationTask};
 use crate::plane::{KnownRig, manifest};
 use crate::stored::{Asked, ProcessError, Processed, Stored};
@@ -49,18 +49,14 @@ impl BoardFindings {
     }
 
     /// What is worth knowing about a result that is good enough.
-    pub fn warnings(&self, task: &CalibrationTask) -> Vec<String> {
+    pub fn warnings(&self) -> Vec<String> {
         let RowTimes { latency_sd_us, useful_frames, .. } = self.times;
         let latency = (latency_sd_us > MOST_LATENCY_SD_US).then(|| {
             format!(
                 "{useful_frames} useful frames: the latency is known to {latency_sd_us:.2} us only; sweeps find the rest from their own light, films do not: raise calibration.delays"
             )
         });
-        let unknown = task.calibration.passes > 0 && self.pixels.linearity.is_none();
-        let curve = unknown.then(|| {
-            "how linear the camera is could not be measured, so it is taken as linear: the room's light saturates exposures of several VSYNC periods, or flickers in them; switch the lamps off"
-                .to_owned()
-        });
+        let curve = self.pixels.curve.warning().map(str::to_owned);
         latency.into_iter().chain(curve).collect()
     }
 
@@ -91,7 +87,7 @@ impl BoardFindings {
                 electrons_per_dn: pair(pixels.transfer.electrons_per_dn),
                 read_noise_e: pair(pixels.transfer.read_noise_e),
                 prnu: pair(pixels.prnu),
-                linearity_per_dn: pixels.linearity.map(|linearity| pair(linearity.per_dn)),
+                linearity_per_dn: pixels.curve.known().map(|linearity| pair(linearity.per_dn)),
                 hot_pixels: pixels.dark.hot.iter().filter(|hot| **hot).count(),
                 response_width_sd: Some(pixels.responses.width_sd()),
             },
@@ -164,7 +160,7 @@ impl BoardFindings {
             ("misread", [self.pixels.places.misread, 1.0]),
             ("chi2_per_sample", [chi2, 3.0]),
         ];
-        let bend = self.pixels.linearity.map(|linearity| ("bend", [linearity.bend.abs(), MOST_BEND]));
+        let bend = self.pixels.curve.known().map(|linearity| ("bend", [linearity.bend.abs(), MOST_BEND]));
         figures.into_iter().chain(bend).map(|(name, figure)| (name.to_owned(), figure)).collect()
     }
 
@@ -221,7 +217,7 @@ pub fn process(
     let camera = before.map_or_else(String::new, |before| before.header.valid_for.camera);
     let kept = findings.keep(session, state, ValidFor::new(&rig, &rig_text, &camera, size))?;
     findings.write(&kept, session, state, &task, &rig)?;
-    let problems = findings.warnings(&task);
+    let problems = findings.warnings();
     Ok(Processed {
         report: session.report_path(),
         stored: state.stored_points(),

@@ -29,7 +29,7 @@ pub(super) fn make(
     kept: &KeptCalibration,
 ) -> Report {
     let mut sections = Vec::new();
-    let warnings = findings.warnings(task);
+    let warnings = findings.warnings();
     if !warnings.is_empty() {
         let notes = warnings.into_iter().map(|warning| Block::Note(NoteLevel::Warning, warning));
         sections.push(section("Warnings", "", notes.collect()));
@@ -72,11 +72,10 @@ fn found(findings: &BoardFindings) -> Block {
         ("read noise / e⁻", pixels.transfer.read_noise_e, 2),
         ("non-uniformity of the pixels", pixels.prnu, 5),
     ];
-    let curve = pixels.linearity.map(|linearity| {
-        let per_mdn = |per_dn: f64| per_dn * 1e6;
+    let curve = pixels.curve.known().map(|linearity| {
         let Estimate { value, sd } = linearity.per_dn;
-        let per_mdn = Estimate { value: per_mdn(value), sd: per_mdn(sd) };
-        ("curve of the camera: a of DN (1 + a DN) / 10⁻⁶", per_mdn, 2)
+        let millionths = Estimate { value: value * 1e6, sd: sd * 1e6 };
+        ("curve of the camera: a of DN (1 + a DN) / 10⁻⁶", millionths, 2)
     });
     let rows = rows.into_iter().chain(curve).map(|(name, Estimate { value, sd }, digits)| {
         vec![name.to_owned(), format!("{value:.digits$}"), format!("{sd:.digits$}")]

@@ -55,7 +55,7 @@ pub struct BoardView {
 /// Levels of grey for the photon transfer.
 const GREYS: [f32; 3] = [0.25, 0.5, 0.75];
 /// Grey of which three passes stay below saturation where a pass of white has 50 to 65 % of full scale.
-const PASSES_GREY: f32 = 0.45;
+pub(super) const PASSES_GREY: f32 = 0.45;
 /// Frames of each number of passes.
 const PASSES_FRAMES: usize = 8;
 /// Number of pictures of sparse rows, and the distance of their rows.

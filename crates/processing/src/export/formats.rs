@@ -355,11 +355,15 @@ impl MatFile {
 fn archive(dir: &Path, to: &Path, accept_damage: bool, scope: ExportScope) -> Result<usize, ProcessError> {
     super::check_new(&Session::open(dir)?, to, "file")?;
     let mut name = to.file_name().unwrap_or_default().to_owned();
-    name.push(".content");
+    // Of this process: another may export the same session at the same time.
+    name.push(format!(".{}.content", std::process::id()));
     durable::with_scratch_dir(&to.with_file_name(name), |scratch| {
         let folder = scratch.join("session");
         let files = super::export(dir, &folder, accept_damage, scope)?;
-        durable::write_with(to, |file| zip_folder(&folder, file))?;
+        let archive = scratch.join("session.zip");
+        durable::write_with(&archive, |file| zip_folder(&folder, file))?;
+        super::check_new(&Session::open(dir)?, to, "file")?;
+        std::fs::rename(&archive, to).map_err(not_copied(to))?;
         Ok(files)
     })
 }

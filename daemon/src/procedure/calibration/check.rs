@@ -23,7 +23,15 @@ pub fn check(calibration: &CalibrationTask, lab: &Lab<'_>) -> Result<CheckReport
     let (mut frames, mut light_periods) = (0, 0);
     for (ordinal, point) in (0..).zip(&task.schedule.points) {
         let shot = task.geometry.shot(point, lab.camera.trigger_latency_us);
-        lab.camera.allows(&shot.settings).map_err(|message| task.refuse(&["calibration"], message))?;
+        lab.camera.allows(&shot.settings).map_err(|message| match calibration.purpose(ordinal) {
+            BoardPurpose::Passes(_) => {
+                let passes = calibration.calibration.passes;
+                let cure = "take calibration.passes = 2, or 0: the camera is then taken as linear";
+                let message = format!("calibration.passes = {passes}: {message}; {cure}");
+                task.refuse(&["calibration", "passes"], message)
+            }
+            _ => task.refuse(&["calibration"], message),
+        })?;
         frames += u64::from(point.frames);
         if !matches!(calibration.purpose(ordinal), BoardPurpose::Capped(_)) {
             light_periods += u64::from(point.frames) * periods(task, lab.camera, point);

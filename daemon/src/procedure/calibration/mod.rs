@@ -16,7 +16,7 @@ use raysweep_processing::calibration::{
 use raysweep_processing::plane::Processing;
 use raysweep_session::Session;
 use raysweep_session::ledger::{EndEntry, EndState, Entry};
-use raysweep_session::stack::StackShape;
+use raysweep_session::stack::{Contents, StackShape};
 
 use crate::plane::{Opened, Passes, PointSink, Taken, missing};
 use crate::procedure::lab::{Lab, RigOfRun};
@@ -36,7 +36,7 @@ struct CalibrationRun {
     camera: String,
 }
 
-/// Predicts a calibration.
+/// Predicts a calibration, or the rest of one that was begun, perhaps by an earlier version, with these contents.
 ///
 /// # Errors
 /// For a plan that cannot be run on this rig.
@@ -45,8 +45,13 @@ pub fn foresee(
     rig: RigOfRun<'_>,
     plan: &Plan,
     own: CalibrationPlan,
+    begun: Option<Contents>,
 ) -> Result<Foreseen, ConfigError> {
-    let calibration = CalibrationTask::new(plan, own, &rig.known()?);
+    let known = rig.known()?;
+    let calibration = match begun {
+        Some(contents) => CalibrationTask::stored(plan, own, &known, contents),
+        None => CalibrationTask::new(plan, own, &known),
+    };
     Ok(Foreseen {
         report: check::check(&calibration, lab)?,
         kind: plan.procedure.kind(),
@@ -189,7 +194,7 @@ impl Measurement for CalibrationRun {
             let kept = found.keep(&session, ledger.state(), valid_for)?;
             found.write(&kept, &session, ledger.state(), &calibration, &rig.file)?;
             kept.use_in(&data)?;
-            warnings = found.warnings(&calibration);
+            warnings = found.warnings();
         }
         Ok(Ended { end, warnings, found: Vec::new() })
     }

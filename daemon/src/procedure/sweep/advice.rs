@@ -129,7 +129,7 @@ mod tests {
             response: PixelResponse::with_beam(Array2::from_shape_fn((720, 16), |(t, _)| t as f32), &shares)
                 .unwrap(),
             white_dn: Array2::from_elem((720, 16), 2500.0),
-            linearity_per_dn: 0.0,
+            curve: None,
             noise: NoiseModel { read_variance: 0.04, gain: 0.09 },
             strip: None,
             lamp: None,

@@ -26,14 +26,23 @@ pub struct BoardCalibration {
     /// Counts above black that a pixel collects in one pass of a white picture, `[t, s]`; NaN where the board was not
     /// lit.
     pub white_dn: Array2<f32>,
-    /// `a` of the camera's curve: what it counts above the dark image, times `1 + a` of that, is proportional to the light.
-    pub linearity_per_dn: f64,
+    /// The camera's curve; `None` for one that is taken as linear.
+    pub curve: Option<CameraCurve>,
     /// Noise of one frame, in shares of white.
     pub noise: NoiseModel,
     /// Where the board stays in view during runs, if it does.
     pub strip: Option<BoardStrip>,
     /// A lamp that flickered in the room; `None` if none did, or it was not measured.
     pub lamp: Option<FlickeringLamp>,
+}
+
+/// The curve of a camera: `DN (1 + a DN)` is proportional to the light, DN counting from an exposure of 0.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CameraCurve {
+    /// `a`.
+    pub per_dn: f64,
+    /// Counts at an exposure of 0, `[t, s]`.
+    pub zero_dn: Array2<f32>,
 }
 
 /// The columns of the image in which the white board stays in view while a scene is measured.

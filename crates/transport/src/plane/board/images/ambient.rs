@@ -392,8 +392,10 @@ impl RowMeans {
             }
             (normal, right, squares)
         });
-        let zero = || (Matrix3::zeros(), Vector3::zeros(), 0.0);
-        let (normal, right, squares) = parts.reduce(zero, |x, y| (x.0 + y.0, x.1 + y.1, x.2 + y.2));
+        // In one order, so that the bits do not depend on the threads.
+        let parts: Vec<(Matrix3<f64>, Vector3<f64>, f64)> = parts.collect();
+        let zero = (Matrix3::zeros(), Vector3::zeros(), 0.0);
+        let (normal, right, squares) = parts.into_iter().fold(zero, |x, y| (x.0 + y.0, x.1 + y.1, x.2 + y.2));
         let samples: usize = self.runs.iter().map(|run| run.deviation.len()).sum();
         (normal, right, squares, samples as f64)
     }

@@ -1,4 +1,4 @@
-use ndarray::{Array, Array2, ArrayView2, ArrayView3, Axis, Dimension, Zip};
+use ndarray::{Array2, ArrayView2, ArrayView3, ArrayViewMut3, Axis, Zip};
 use rayon::prelude::*;
 
 use super::{Estimate, ImagesError, check_frames, check_range, check_shape, is_usable, mean_image, median};
@@ -24,7 +24,7 @@ impl LightLevel<'_> {
     }
 }
 
-/// The curve of the camera's response: `DN (1 + a DN)` is proportional to the light, DN counting from the dark image.
+/// The curve of the camera's response: `DN (1 + a DN)` is proportional to the light, DN counting from an exposure of 0.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Linearity {
     /// `a`.
@@ -37,6 +37,8 @@ pub struct Linearity {
 pub const MOST_BEND: f64 = 0.03;
 /// Standard deviations by which a bend is certainly larger.
 const CERTAIN: f64 = 3.0;
+/// Share of the pixels that must not be cut off.
+const LEAST_KEPT: f64 = 0.5;
 /// Pixels whose brightest level exceeds this share of full scale may be cut off in some frames.
 const HIGHEST_SHARE: f32 = 0.97;
 
@@ -46,7 +48,7 @@ impl Linearity {
     /// whatever changes between frames; it takes at least 4 frames a level.
     ///
     /// # Errors
-    /// [`ImagesError::Curved`] beyond 3 % of `full_scale_dn` by more than 3 standard deviations, where gamma is on; [`ImagesError::TooFew`];
+    /// [`ImagesError::Curved`] beyond 3 % of `full_scale_dn` by more than 3 standard deviations: gamma is on; [`ImagesError::TooFew`];
     /// [`ImagesError::Shape`]; [`ImagesError::OutOfRange`].
     pub fn new(
         levels: &[LightLevel],
@@ -72,9 +74,11 @@ impl Linearity {
                 })
         });
         let pixels = kept.iter().filter(|kept| **kept).count();
-        if pixels == 0 {
+        // Where only the darker ones of equal pixels are left, their noise is what selects them.
+        let needed = ((LEAST_KEPT * kept.len() as f64) as usize).max(1);
+        if pixels < needed {
             let what = "pixels that are lit and do not saturate at any level";
-            return Err(ImagesError::TooFew { what, given: 0, needed: 1, cure: "take a darker grey" });
+            return Err(ImagesError::TooFew { what, given: pixels, needed, cure: "take a darker grey" });
         }
         let images: Vec<ArrayView2<f32>> = means.iter().map(|mean| mean.view()).collect();
         let value = curve(levels, &images, &kept);
@@ -95,28 +99,39 @@ impl Linearity {
         Ok(Self { per_dn: Estimate { value, sd }, bend })
     }
 
-    /// Makes an image, or several, proportional to the light; `image` has the dark image subtracted.
-    pub fn straighten<D: Dimension>(&self, image: &mut Array<f32, D>) {
+    /// Makes images of these pixels `[n, t, s]` proportional to the light; `zero_dn` are their counts at an exposure of 0,
+    /// `[t, s]`, which stay as they are.
+    pub fn straighten(&self, mut images: ArrayViewMut3<'_, f32>, zero_dn: &Array2<f32>) {
         let a = self.per_dn.value as f32;
-        image.par_mapv_inplace(|dn| dn * (1.0 + a * dn));
+        for mut image in images.outer_iter_mut() {
+            Zip::from(&mut image).and(zero_dn).par_for_each(|dn, zero| {
+                let above = *dn - zero;
+                *dn = zero + above * (1.0 + a * above);
+            });
+        }
     }
 }
 
 /// Pixels are averaged over blocks of this many rows and columns: noise does not average out of squares.
 const BLOCK: usize = 16;
+/// The four colours that a mosaic may have: whether row and column are odd.
+const MOSAIC: [[usize; 2]; 4] = [[0, 0], [0, 1], [1, 0], [1, 1]];
 
 /// The `a` for which `y (1 + a y)` of each block of kept pixels is closest to its own multiple of the levels' light.
 /// Levels are weighted with 1 / light, as is shot noise.
 fn curve(levels: &[LightLevel], images: &[ArrayView2<f32>], kept: &Array2<bool>) -> f64 {
     let light: f64 = levels.iter().map(|level| level.light).sum();
     let (rows, columns) = kept.dim();
+    // Pixels of one colour of a mosaic are averaged apart: squares of a mean do not see what differs within it.
+    let parts = (0..columns).step_by(BLOCK).flat_map(|first| MOSAIC.map(|part| (first, part)));
+    let parts: Vec<(usize, [usize; 2])> = parts.collect();
     let sums = (0..rows.div_ceil(BLOCK)).into_par_iter().map(|block_row| {
         let mut sums = [0.0; 2];
-        for first in (0..columns).step_by(BLOCK) {
+        for &(first, [odd_row, odd_column]) in &parts {
             let inside = || {
                 let rows = block_row * BLOCK..((block_row + 1) * BLOCK).min(rows);
                 rows.flat_map(move |t| (first..(first + BLOCK).min(columns)).map(move |s| (t, s)))
-                    .filter(|at| kept[*at])
+                    .filter(|&(t, s)| kept[[t, s]] && [t % 2, s % 2] == [odd_row, odd_column])
             };
             let pixels = inside().count() as f64;
             if pixels == 0.0 {
@@ -136,7 +151,9 @@ fn curve(levels: &[LightLevel], images: &[ArrayView2<f32>], kept: &Array2<bool>)
         }
         sums
     });
-    let [product, square] = sums.reduce(|| [0.0; 2], |a, b| [a[0] + b[0], a[1] + b[1]]);
+    // In one order, so that the bits do not depend on the threads.
+    let sums: Vec<[f64; 2]> = sums.collect();
+    let [product, square] = [0, 1].map(|of| sums.iter().map(|sums| sums[of]).sum::<f64>());
     -product / square
 }
 

@@ -1,6 +1,6 @@
 use ndarray::{Array2, ArrayView3, Axis, Zip};
 
-use super::{Estimate, ImagesError, Linearity, SensorNoise, check_frames, check_shape, mean_image, median};
+use super::{Estimate, ImagesError, SensorNoise, check_frames, check_shape, mean_image, median};
 
 /// What a pixel collects of the white picture in one pass of the beam, black picture subtracted.
 ///
@@ -64,20 +64,6 @@ impl WhiteMap {
             white_dn,
             sd_dn,
         })
-    }
-
-    /// The same white as counts that are proportional to the light.
-    #[must_use]
-    pub fn straightened(mut self, linearity: &Linearity) -> Self {
-        let slope = |dn: f64| 1.0 + 2.0 * linearity.per_dn.value * dn;
-        Zip::from(&mut self.sd_dn)
-            .and(&self.white_dn)
-            .for_each(|sd, &white| *sd *= slope(f64::from(white)) as f32);
-        linearity.straighten(&mut self.white_dn);
-        let Estimate { value, sd } = self.level_dn;
-        let level = value * (1.0 + linearity.per_dn.value * value);
-        self.level_dn = Estimate { value: level, sd: sd * slope(value) };
-        self
     }
 
     /// Refuses a white that is of no use for calibration.
