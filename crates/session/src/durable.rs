@@ -122,7 +122,8 @@ pub fn replace_dir<T, E: From<Error>>(
     Ok(filled)
 }
 
-/// Calls `work` with an empty folder next to `path`, which is removed afterwards; one that a crash left behind is replaced.
+/// Calls `work` with an empty folder next to `path`, which is removed afterwards; one that a crash left behind is
+/// replaced.
 ///
 /// # Errors
 /// The error of `work`, or [`Error::Io`].

@@ -48,7 +48,8 @@ impl Linearity {
     /// whatever changes between frames; it takes at least 4 frames a level.
     ///
     /// # Errors
-    /// [`ImagesError::Curved`] beyond 3 % of `full_scale_dn` by more than 3 standard deviations: gamma is on; [`ImagesError::TooFew`];
+    /// [`ImagesError::Curved`] beyond 3 % of `full_scale_dn` by more than 3 standard deviations: gamma is on;
+    /// [`ImagesError::TooFew`];
     /// [`ImagesError::Shape`]; [`ImagesError::OutOfRange`].
     pub fn new(
         levels: &[LightLevel],
