@@ -317,7 +317,7 @@ fn a_calibration_of_other_devices_or_a_damaged_one_is_refused_unless_overridden(
         let text = text.replace(curve, &format!("linearity_per_dn = {wrong}"));
         fs::write(current.join("calibration.toml"), text).unwrap();
         let message = refusal(&bench);
-        assert!(message.contains("linearity_per_dn") && message.contains("must be"), "{message}");
+        assert!(message.contains("calibration.toml: light.linearity_per_dn"), "{message}");
     }
     fs::copy(first.session.join("calibration.toml"), current.join("calibration.toml")).unwrap();
     fs::remove_file(current.join("calibration.npz")).unwrap();

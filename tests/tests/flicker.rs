@@ -108,3 +108,22 @@ fn a_lamp_in_step_with_the_frames_is_refused() {
     let said = ended.error.unwrap_or_default();
     assert!(said.contains("120.") && said.contains("switch the lamp off"), "{said}");
 }
+
+#[test]
+fn no_lamp_and_no_bright_board_bends_the_curve_of_a_linear_camera() {
+    // Frames of whole periods see the same phases of 100 Hz again and again; under a bright white, three passes of grey
+    // saturate all but the pixels with less of noise.
+    for rig in [
+        "[sim.truth]\nwhite_dn = 1900\n[sim.ambient]\nlevel = 0.0002\nflicker = 0.3\n",
+        "[sim.ambient]\nlevel = 0.00006\nflicker = 1.0\n",
+        "[sim.truth]\nwhite_dn = 2850\n",
+        "[sim.truth]\nwhite_dn = 1900\n[sim.ambient]\nlevel = 0.0001\n",
+    ] {
+        let (_bench, ended) = calibrated(rig);
+        assert_eq!(ended.state, "complete", "{rig}: {:?}", ended.error);
+        let found = KeptCalibration::read(&ended.session).unwrap().unwrap().header.light.linearity_per_dn;
+        println!("{rig:?}: {found:?}");
+        // A thousandth of full scale.
+        assert!(found.is_none_or(|[per_dn, _]| per_dn.abs() < 2.5e-7), "{rig}: {found:?}");
+    }
+}

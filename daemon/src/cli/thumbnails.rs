@@ -66,13 +66,16 @@ pub(super) fn small(session: &Session, name: &str) -> raysweep_session::Result<O
 
 /// Writes a small PNG file of each picture of a session into `folder`; returns their paths.
 pub(super) fn write(session: &Session, folder: &Path) -> Result<Vec<PathBuf>, CommandFailure> {
-    // Before a folder is made where none is wanted.
-    picture_file::check(&folder.join("picture.png"))?;
+    let paths: Vec<(String, PathBuf)> = pictures(session)
+        .into_iter()
+        .map(|name| (name.clone(), folder.join(format!("{name}.png"))))
+        .collect();
+    // All of them, before a folder is made or a picture written where none is wanted.
+    paths.iter().try_for_each(|(_, path)| picture_file::check(path))?;
     fs::create_dir_all(folder).map_err(|source| CommandFailure::Write { path: folder.to_owned(), source })?;
     let mut written = Vec::new();
-    for name in pictures(session) {
+    for (name, path) in paths {
         let Some(png) = small(session, &name).map_err(ProcessError::from)? else { continue };
-        let path = folder.join(format!("{name}.png"));
         picture_file::write(&path, &png)?;
         written.push(path);
     }

@@ -239,24 +239,9 @@ impl CalibrationArrays {
         })
     }
 
-    /// Checks that all arrays belong to one rig, and that the rows seen exist.
+    /// Checks that all arrays belong to one rig.
     fn check(&self, header: &CalibrationHeader) -> Result<(), String> {
         let of = &header.valid_for;
-        let [first, end] = header.timing.seen_rows;
-        if first >= end || end > of.projector_rows {
-            return Err(format!(
-                "seen_rows = [{first}, {end}]: must be [first row, row after the last] of the {} projector rows",
-                of.projector_rows
-            ));
-        }
-        if let Some([per_dn, sd]) = header.light.linearity_per_dn
-            && !(per_dn.abs() <= MOST_CURVE_PER_DN && sd >= 0.0)
-        {
-            return Err(format!(
-                "light.linearity_per_dn = [{per_dn}, {sd}]: must be from {} to {MOST_CURVE_PER_DN}, with a standard deviation of 0 or more",
-                -MOST_CURVE_PER_DN
-            ));
-        }
         let [rows, columns] = of.size;
         let image = [rows, columns];
         let shapes: [(&str, &[usize], &[usize]); 9] = [
@@ -284,8 +269,10 @@ impl KeptCalibration {
     /// Joins header and arrays, and states the arrays' checksum.
     ///
     /// # Errors
-    /// When the arrays cannot be encoded.
+    /// When header and arrays do not fit together, or cannot be encoded.
     pub fn new(header: CalibrationHeader, arrays: CalibrationArrays) -> raysweep_session::Result<Self> {
+        // What could not be read again must not replace a calibration in use.
+        header.check().and_then(|()| arrays.check(&header)).map_err(not_encoded)?;
         let arrays_sha256 = sha256(&encoded(&arrays)?);
         Ok(Self { header: CalibrationHeader { arrays_sha256, ..header }, arrays })
     }
@@ -484,7 +471,26 @@ impl CalibrationHeader {
             let schema = header.schema;
             return Err(in_file(format!("schema = {schema}: this version reads {SCHEMA}; calibrate again")));
         }
+        header.check().map_err(in_file)?;
         Ok(Some(header))
+    }
+
+    /// Checks that the rows seen exist, and that the curve is one that is accepted.
+    fn check(&self) -> Result<(), String> {
+        let rows = self.valid_for.projector_rows;
+        let [first, end] = self.timing.seen_rows;
+        if first >= end || end > rows {
+            return Err(format!(
+                "seen_rows = [{first}, {end}]: must be [first row, row after the last] of the {rows} projector rows"
+            ));
+        }
+        match self.light.linearity_per_dn {
+            Some([per_dn, sd]) if !(per_dn.abs() <= MOST_CURVE_PER_DN && sd >= 0.0) => Err(format!(
+                "light.linearity_per_dn = [{per_dn}, {sd}]: must be from {} to {MOST_CURVE_PER_DN}, with a standard deviation of 0 or more",
+                -MOST_CURVE_PER_DN
+            )),
+            _ => Ok(()),
+        }
     }
 
     /// The largest `calibration.npz` that belongs to this header.
