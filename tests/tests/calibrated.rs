@@ -196,8 +196,8 @@ impl Studio {
             let began = Instant::now();
             let transport = solver.solve(&frames, &dark, &|| true).unwrap();
             let solved = began.elapsed();
-            let drift = solver.learn(&frames, &dark);
-            println!("solved in {solved:?}, learned {drift:?} in {:?}", began.elapsed() - solved);
+            let learned = solver.learn(&frames, &dark);
+            println!("solved in {solved:?}, learned {learned:?} in {:?}", began.elapsed() - solved);
             transport
         };
         (0..6).map(cycle).collect()
@@ -327,7 +327,7 @@ fn a_strip_of_the_board_shows_how_late_each_image_is() {
 }
 
 #[test]
-fn films_find_their_latency_in_the_first_cycles() {
+fn films_learn_from_their_first_cycles() {
     let studio = Studio::new();
     let errors = |geometry: &SweepGeometry| -> Vec<f64> {
         let errors = studio.film(geometry).iter().map(|cycle| studio.error(cycle)).collect();
@@ -335,9 +335,14 @@ fn films_find_their_latency_in_the_first_cycles() {
         errors
     };
     let most = |errors: &[f64]| errors.iter().copied().fold(0.0, f64::max);
-    // Measured: 1.03 without, 0.028 with; 0.045 in the first cycles of a film whose light is late, then 0.031.
+    // Measured: 1.03 without, 0.028 with, and 0.016 where neighbours are averaged; 0.046 in the first cycles of a film
+    // whose light is late, then 0.020.
     assert!(errors(&studio.stated)[0] > 0.2);
-    assert!(most(&errors(&studio.calibrated(0.0))) < 0.05);
-    let late = errors(&studio.calibrated(1.3));
-    assert!(most(&late) < 0.07 && most(&late[4..]) < 0.8 * late[0], "{late:?}");
+    let errors_of = |late_us: f64| {
+        let errors = errors(&studio.calibrated(late_us));
+        [most(&errors[..4]), most(&errors[4..])]
+    };
+    let ([first, later], [first_late, later_late]) = (errors_of(0.0), errors_of(1.3));
+    assert!(first < 0.04 && later < 0.02, "{first}, then {later}");
+    assert!(first_late < 0.06 && later_late < 0.025, "{first_late}, then {later_late}");
 }

@@ -27,9 +27,13 @@ pub struct FilmSummary {
     /// calibration, or for a film of few cycles.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub late_us: Option<f64>,
-    /// What the first cycles showed to be wrong with the calibration.
+    /// How the cycles after the first few were demultiplexed, and why: each a subject and a sentence. Empty for a film
+    /// of few cycles.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub calibration_warnings: Vec<String>,
+    pub findings: Vec<(String, String)>,
+    /// What the first cycles showed to be wrong.
+    #[serde(default, skip_serializing_if = "Vec::is_empty", alias = "calibration_warnings")]
+    pub warnings: Vec<String>,
 }
 
 /// Percentiles of repeated measurements.

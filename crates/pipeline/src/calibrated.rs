@@ -16,7 +16,7 @@ const NEAR_ROWS: f64 = 0.1;
 
 /// How a rig has changed since its calibration.
 #[derive(Debug, Clone, PartialEq)]
-pub struct CalibrationDrift {
+pub(crate) struct CalibrationDrift {
     /// By how much later than calibrated light arrives; 0 if it was not found, or is not to be believed.
     pub late_us: f64,
     /// Standard deviation of that time; `None` if the calibration's own time is kept.

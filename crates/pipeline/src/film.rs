@@ -6,12 +6,12 @@ use ndarray::{Array2, Array3, Axis};
 use raysweep_core::{CameraCapabilities, CameraSettings, Counts};
 use raysweep_transport::plane::{Demux, PlaneError, Setting, Transport};
 
-use crate::calibrated::{CalibrationDrift, Images};
 use crate::demux::{DEMUX, DemuxFold, DemuxOptions};
+use crate::findings::{Choices, Findings, choose, rows_to_choose_by};
 use crate::jitter::StripGauge;
 use crate::scale::LightScale;
-use crate::schedule::{Schedule, SweepGeometry};
-use crate::spot::SpotCut;
+use crate::schedule::{PointRole, Schedule, SweepGeometry};
+use crate::stack::SweepStack;
 use crate::stage_refused::StageRefused;
 use crate::strips::NotSolved;
 use crate::unit::Unit;
@@ -116,21 +116,25 @@ impl Cycle {
     }
 }
 
-/// Cycles from whose mean a film's latency is found: enough for single frames' noise and jitter, and no more than wait
-/// for a solver at a time, so that a film processed again finds it from the same cycles.
-const LATENCY_CYCLES: usize = 4;
+/// Cycles from whose mean a film learns: enough for single frames' noise and jitter, and no more than wait for a solver
+/// at a time, so that a film processed again learns from the same cycles.
+const FIRST_CYCLES: usize = 4;
 
 /// Computes a cycle's light transport from its frames.
 pub struct FilmSolver {
+    options: DemuxOptions,
+    /// The plan's demultiplexer.
     demux: Demux,
     geometry: SweepGeometry,
     scale: LightScale,
     /// Which pixels have a scale, `[t, s]`.
     measured: Array2<bool>,
-    /// By how much later than calibrated light arrives, as far as the film has shown.
-    late_us: f64,
-    /// The film's first cycles; `None` without a calibration, or after they have shown the latency.
+    /// Number of frames in the dark image.
+    dark_frames: usize,
+    /// The film's first cycles; `None` after it has learned from them.
     first: Option<FirstCycles>,
+    /// What they showed; `None` before.
+    choices: Option<Choices>,
     /// The strip of the board that shows each frame's jitter, if it is in view.
     strip: Option<StripGauge>,
 }
@@ -139,14 +143,7 @@ pub struct FilmSolver {
 #[derive(Default)]
 struct FirstCycles {
     cycles: usize,
-    sum: Option<FilmStack>,
-}
-
-/// The frames of a cycle, ready to be demultiplexed; see [`crate::SweepStack`].
-struct FilmStack {
-    settings: Vec<Setting>,
-    images: Array3<f32>,
-    valid: Option<Array3<bool>>,
+    sum: Option<SweepStack>,
 }
 
 impl FilmSolver {
@@ -159,15 +156,22 @@ impl FilmSolver {
         schedule: &Schedule,
         geometry: &SweepGeometry,
     ) -> Result<Self, StageRefused> {
-        let demux = DemuxFold::new(options, schedule, geometry)?
-            .demux()
-            .map_err(|error| StageRefused::Invalid { name: DEMUX.into(), what: error.to_string() })?;
+        let invalid =
+            |error: PlaneError| StageRefused::Invalid { name: DEMUX.into(), what: error.to_string() };
+        let demux = DemuxFold::new(options, schedule, geometry)?.demux().map_err(invalid)?;
         let rows: Vec<usize> = (0..geometry.height).collect();
-        let (scale, measured) = (geometry.scale_of(&rows), geometry.white_of(&rows).mapv(f64::is_finite));
-        let first = geometry.calibration.as_ref().map(|_| FirstCycles::default());
-        let strip = StripGauge::of(geometry)
-            .map_err(|error| StageRefused::Invalid { name: DEMUX.into(), what: error.to_string() })?;
-        Ok(Self { demux, geometry: geometry.clone(), scale, measured, late_us: 0.0, first, strip })
+        let dark = schedule.points.iter().find(|point| matches!(point.role, PointRole::Dark(_)));
+        Ok(Self {
+            options,
+            demux,
+            geometry: geometry.clone(),
+            scale: geometry.scale_of(&rows),
+            measured: geometry.white_of(&rows).mapv(f64::is_finite),
+            dark_frames: dark.map_or(1, |dark| dark.frames as usize),
+            first: Some(FirstCycles::default()),
+            choices: None,
+            strip: StripGauge::of(geometry).map_err(invalid)?,
+        })
     }
 
     /// The relative rows that are estimated: first and last.
@@ -193,49 +197,45 @@ impl FilmSolver {
         go_on: &(dyn Fn() -> bool + Sync),
     ) -> Result<Transport, NotSolved> {
         let mut stack = self.stack(frames, dark);
-        stack.settings.iter_mut().for_each(|setting| *setting = setting.earlier(self.late_us));
-        self.without_spot(&mut stack)
-            .and_then(|cut| cut.modelled_by(self.demux.with_settings(stack.settings)?))
-            .and_then(|demux| {
-                demux.solve_while(stack.images.view(), stack.valid.as_ref().map(|valid| valid.view()), go_on)
-            })
-            .map_err(|error| NotSolved { of: "film", what: error.to_string() })
+        let planned;
+        let choices = match &self.choices {
+            Some(choices) => choices,
+            None => {
+                planned = Choices::planned(&self.demux, &self.geometry, &stack).map_err(not_solved)?;
+                &planned
+            }
+        };
+        choices.solve(0..self.geometry.height, 0, &mut stack, go_on).map_err(not_solved)
     }
 
-    /// Takes the frames of another complete cycle, as for [`Self::solve`]. Once it has the first few, it finds from
-    /// their mean by how much later than calibrated light arrives, which the cycles after them are solved with, and
-    /// returns what it found. Takes about as long as solving a small cycle, and only this once.
+    /// Takes the frames of another complete cycle, as for [`Self::solve`]. Once it has the first few, it chooses from
+    /// their mean how to demultiplex the cycles after them, as a sweep does from its images, and returns what it found.
+    /// Takes about as long as solving a few small cycles, and only this once.
+    ///
+    /// # Errors
+    /// If their mean does not give a valid model; then the cycles after them are demultiplexed as planned, too.
     pub fn learn(
         &mut self,
         frames: &[(Setting, Arc<Array2<f32>>)],
         dark: &Array2<f32>,
-    ) -> Option<CalibrationDrift> {
+    ) -> Option<Result<&Findings, NotSolved>> {
         let mut first = self.first.take()?;
         first.add(self.stack(frames, dark));
-        if first.cycles < LATENCY_CYCLES {
+        if first.cycles < FIRST_CYCLES {
             self.first = Some(first);
             return None;
         }
         let mut mean = first.sum?;
         mean.images /= first.cycles as f32;
-        self.without_spot(&mut mean).ok()?;
-        let rows: Vec<usize> = (0..self.geometry.height).collect();
-        let valid = mean.valid.as_ref().map(|valid| valid.view());
-        let images = Images { rows: &rows, images: mean.images.view(), valid };
-        let drift = CalibrationDrift::of(self.demux.timing(), &mean.settings, &images);
-        self.late_us = drift.late_us;
-        Some(drift)
-    }
-
-    /// Leaves out the images that a flying spot makes unreliable.
-    fn without_spot(&self, stack: &mut FilmStack) -> Result<SpotCut, PlaneError> {
-        let cut = SpotCut::of(&self.geometry, self.demux.timing(), &stack.settings)?;
-        stack.keep(|n| cut.keeps(n));
-        Ok(cut)
+        let rows = rows_to_choose_by(self.geometry.height);
+        Some(match choose(&self.demux, &self.options, &self.geometry, &rows, mean.of_rows(&rows)) {
+            Ok(choices) => Ok(&self.choices.insert(choices).findings),
+            Err(error) => Err(not_solved(error)),
+        })
     }
 
     /// These frames as the model sees them.
-    fn stack(&self, frames: &[(Setting, Arc<Array2<f32>>)], dark: &Array2<f32>) -> FilmStack {
+    fn stack(&self, frames: &[(Setting, Arc<Array2<f32>>)], dark: &Array2<f32>) -> SweepStack {
         let is_unsaturated = |counts: f32| f64::from(counts) < self.geometry.saturation_dn;
         let shape = (frames.len(), self.geometry.height, self.geometry.width);
         let saturates =
@@ -257,24 +257,32 @@ impl FilmSolver {
             });
             setting.earlier(late_us.unwrap_or(0.0))
         };
-        FilmStack { settings: frames.iter().map(setting).collect(), images, valid }
-    }
-}
-
-impl FilmStack {
-    /// Keeps the images for whose index `kept` returns true.
-    fn keep(&mut self, kept: impl Fn(usize) -> bool) {
-        let kept: Vec<usize> = (0..self.settings.len()).filter(|&n| kept(n)).collect();
-        if kept.len() < self.settings.len() {
-            self.settings = kept.iter().map(|&n| self.settings[n].clone()).collect();
-            self.images = self.images.select(Axis(0), &kept);
-            self.valid = self.valid.as_ref().map(|valid| valid.select(Axis(0), &kept));
+        SweepStack {
+            timing: self.demux.timing().clone(),
+            prior: self.demux.prior(),
+            exposures_us: frames.iter().map(|(setting, _)| setting.exposure_us).collect(),
+            settings: frames.iter().map(setting).collect(),
+            dark_frames: vec![self.dark_frames; frames.len()],
+            calibration: None,
+            images,
+            valid,
+            regular: None,
+            regular_valid: None,
+            filled: None,
+            noise: None,
+            variance_ratio: None,
+            u0_rows: None,
+            one_band: false,
         }
     }
 }
 
+fn not_solved(error: PlaneError) -> NotSolved {
+    NotSolved { of: "film", what: error.to_string() }
+}
+
 impl FirstCycles {
-    fn add(&mut self, cycle: FilmStack) {
+    fn add(&mut self, cycle: SweepStack) {
         self.cycles += 1;
         let Some(sum) = &mut self.sum else {
             self.sum = Some(cycle);

@@ -88,20 +88,7 @@ pub fn choose(
     rows: &[usize],
     mut stack: SweepStack,
 ) -> Result<Choices, PlaneError> {
-    let mut findings = Findings {
-        prior: planned.prior(),
-        choice: None,
-        beam_sigma_rows: match geometry.calibration {
-            Some(_) => None,
-            None => geometry.beam_sigma_rows.or(Some(0.0)),
-        },
-        late_us: None,
-        u0_rows: 0.0,
-        one_band: false,
-        left_out_us: Vec::new(),
-        remarks: Vec::new(),
-        warnings: Vec::new(),
-    };
+    let mut findings = Findings::planned(planned.prior(), geometry);
     let all: Vec<usize> = (0..stack.settings.len()).collect();
     let settings = stack.settings.clone();
     let cut = SpotCut::of(geometry, &stack.timing, &stack.settings)?;
@@ -178,6 +165,24 @@ pub fn choose(
 }
 
 impl Findings {
+    /// What is known before any image is looked at.
+    fn planned(prior: Prior, geometry: &SweepGeometry) -> Self {
+        Self {
+            prior,
+            choice: None,
+            beam_sigma_rows: match geometry.calibration {
+                Some(_) => None,
+                None => geometry.beam_sigma_rows.or(Some(0.0)),
+            },
+            late_us: None,
+            u0_rows: 0.0,
+            one_band: false,
+            left_out_us: Vec::new(),
+            remarks: Vec::new(),
+            warnings: Vec::new(),
+        }
+    }
+
     /// Adds what was found of the room's light.
     pub(crate) fn add_room(&mut self, RoomFindings { remark, warning }: RoomFindings) {
         self.remarks.extend(remark);
@@ -223,6 +228,30 @@ impl Findings {
 }
 
 impl Choices {
+    /// What rig file and plan say, for images with the settings of `stack`, whose light is not looked at.
+    ///
+    /// # Errors
+    /// If they do not give a valid model.
+    pub(crate) fn planned(
+        planned: &Demux,
+        geometry: &SweepGeometry,
+        stack: &SweepStack,
+    ) -> Result<Self, PlaneError> {
+        let cut = SpotCut::of(geometry, &stack.timing, &stack.settings)?;
+        let kept: Vec<usize> = (0..stack.settings.len()).filter(|&n| cut.keeps(n)).collect();
+        let settings = kept.iter().map(|&n| stack.settings[n].clone()).collect();
+        Ok(Self {
+            demux: cut.modelled_by(planned.with_settings(settings)?)?,
+            kept,
+            steady: Vec::new(),
+            late_us: 0.0,
+            calibration: None,
+            noise: None,
+            coupling: None,
+            findings: Findings::planned(planned.prior(), geometry),
+        })
+    }
+
     /// The same with an image under less light for pixels that saturate, whose level is found from the rows of
     /// [`rows_to_choose_by`]: `stack` contains only the camera rows `rows`.
     ///

@@ -31,7 +31,6 @@ mod unit;
 pub use assembler::{
     Assembler, AssemblerConfig, Decision, DeviceEvent, EXPOSURE_TOLERANCE_US, Failure, Job, Label,
 };
-pub use calibrated::CalibrationDrift;
 pub use demux::{DEMUX, DemuxFold, DemuxOptions, PREDICTED_SHARE, Snapshot, Solved, SweepSummary};
 pub use edges::{EdgeTracker, Found, Line};
 pub use film::{Cycle, CycleOrder, FilmFrame, FilmSolver};

@@ -7,5 +7,5 @@ mod task;
 
 pub use self::process::process;
 pub use self::product::{FilmProducts, write_products};
-pub use self::report::{shortcomings, write as write_report};
+pub use self::report::{note_findings, shortcomings, write as write_report};
 pub use self::task::{FilmTask, create_transports};

@@ -13,7 +13,7 @@ use raysweep_session::stack::ArrayName;
 use raysweep_transport::plane::Setting;
 
 use super::product::write_products;
-use super::report;
+use super::report::{self, note_findings};
 use super::task::{FilmTask, create_transports};
 use crate::plane::{append_argument, manifest, unit_of};
 use crate::stored::{Asked, ProcessError, Processed, Stored};
@@ -32,7 +32,9 @@ pub fn process(stored: &Stored<'_>, film: FilmPlan, asked: &Asked) -> Result<Pro
     let stages = task.stages().map_err(|error| stored.in_plan(&error))?;
     let (specs, wanted) = products(&task, asked, stored)?;
     let is_wanted = |name: &str| specs[..wanted].iter().any(|spec| spec.name() == name);
-    let mut problems = make_transports(session, &task, state, &stages)?;
+    let mut state = State::clone(state);
+    let mut problems = make_transports(session, &task, &mut state, &stages)?;
+    let state = &state;
     let mut products = write_products(session, state, &task, &specs, &is_wanted, &|| true)?;
     problems.append(&mut products.problems);
     report::write(session, state, &task, &products, &problems)?;
@@ -72,11 +74,12 @@ fn products(
     Ok((specs, wanted))
 }
 
-/// Computes the transports of all stored cycles; returns the problems.
+/// Computes the transports of all stored cycles, and enters into the film's summary what its first cycles showed;
+/// returns the problems.
 fn make_transports(
     session: &Session,
     task: &FilmTask,
-    state: &State,
+    state: &mut State,
     stages: &Stages,
 ) -> raysweep_session::Result<Vec<String>> {
     let mut problems = state.left_out();
@@ -93,6 +96,7 @@ fn make_transports(
     };
     let film = session.film()?;
     let transports = create_transports(session, task, solver.reach_rows())?;
+    let mut summary = state.film.clone().unwrap_or_default();
     for entry in state.cycles() {
         let frames = match film.read(entry.cycle) {
             Ok(Some(frames)) if crc32(frames.view()) == entry.crc32 => frames,
@@ -125,15 +129,14 @@ fn make_transports(
         match solved {
             Ok((transport, images)) => {
                 transports.write(entry.cycle, transport.t.view())?;
-                let drift = solver.learn(&images, &dark);
-                // Otherwise the ledger says what the film itself found.
-                problems.extend(
-                    drift.filter(|_| state.film.is_none()).into_iter().flat_map(|drift| drift.warnings),
-                );
+                if let Some(learned) = solver.learn(&images, &dark) {
+                    note_findings(&mut summary, learned);
+                }
             }
             Err(error) => problems.push(format!("cycle {}: {error}", entry.cycle)),
         }
     }
+    state.film = Some(summary);
     Ok(problems)
 }
 

@@ -1,7 +1,8 @@
 //! The report of a film: selected cycles, and how well it kept its pace.
 
 use ndarray::{Array2, ArrayView2, Axis, s};
-use raysweep_core::Percentiles;
+use raysweep_core::{FilmSummary, Percentiles};
+use raysweep_pipeline::{Findings, NotSolved};
 use raysweep_session::film::TransportFilm;
 use raysweep_session::ledger::State;
 use raysweep_session::report::{
@@ -51,9 +52,26 @@ fn make(
     }
     sections.push(cycles(session, state)?);
     sections.extend(products.videos.iter().map(video));
+    sections.extend(findings(state));
     sections.push(pace(state));
     sections.push(trust(state, task));
     Ok(page(session, state, facts(state, task), sections))
+}
+
+/// Enters what a film's first cycles showed into its summary.
+pub fn note_findings(film: &mut FilmSummary, learned: std::result::Result<&Findings, NotSolved>) {
+    match learned {
+        Ok(found) => {
+            let said = found.remarks.iter().map(|(subject, said)| ((*subject).to_owned(), said.clone()));
+            film.findings = said.collect();
+            film.late_us = found.late_us;
+            film.warnings.clone_from(&found.warnings);
+        }
+        Err(error) => {
+            film.warnings =
+                vec![format!("demultiplexed as planned, for the first cycles show nothing: {error}")];
+        }
+    }
 }
 
 /// The number of stored cycles that have no transport; those that were missing when the film ended may have been made
@@ -84,7 +102,7 @@ pub fn shortcomings(state: &State, transports_missing: usize) -> Vec<String> {
             "{transports_missing} stored cycles have no transport: `raysweep process` makes them"
         ));
     }
-    texts.extend(film.calibration_warnings.iter().cloned());
+    texts.extend(film.warnings.iter().cloned());
     texts
 }
 
@@ -163,6 +181,17 @@ fn video(FilmVideo { name, about, pictures }: &FilmVideo) -> Section {
     }
 }
 
+/// What the film's first cycles showed, if it had enough of them.
+fn findings(state: &State) -> Option<Section> {
+    let film = state.film.as_ref().filter(|film| !film.findings.is_empty())?;
+    Some(Section {
+        title: "How the cycles were demultiplexed".into(),
+        intro: "From the mean of the first four cycles, which themselves were demultiplexed as planned."
+            .into(),
+        blocks: vec![Block::Facts(film.findings.clone())],
+    })
+}
+
 fn pace(state: &State) -> Section {
     let film = state.film.clone().unwrap_or_default();
     let mut entries = vec![
@@ -172,9 +201,6 @@ fn pace(state: &State) -> Section {
         ("transports made during the film", film.transports.to_string()),
         ("sliding estimates", film.sliding_estimates.to_string()),
     ];
-    if let Some(late_us) = film.late_us {
-        entries.push(("light later than calibrated", format!("{late_us:.2} µs, from the first cycles")));
-    }
     match film.latency_ms {
         Some(Percentiles { p50, p95, p99, max }) => {
             let text = format!("{p50:.0} / {p95:.0} / {p99:.0} / {max:.0} ms");

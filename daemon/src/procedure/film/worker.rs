@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use ndarray::Array2;
 use raysweep_core::{Clock, FilmSummary, Percentiles};
 use raysweep_pipeline::{FilmSolver, PipelineError};
+use raysweep_processing::film::note_findings;
 use raysweep_proto::{Event, FilmEstimate};
 use raysweep_session::film::TransportFilm;
 use raysweep_transport::plane::{Setting, Transport};
@@ -257,12 +258,9 @@ impl Solving {
                 self.orders.give(Order::Fault);
                 return Err(error);
             }
-            if !is_sliding && let Some(drift) = workers.install(|| self.solver.learn(frames, dark)) {
-                drift.warnings.iter().for_each(|warning| tracing::warn!("{warning}"));
-                self.account.note(|film| {
-                    film.late_us = Some(drift.late_us);
-                    film.calibration_warnings = drift.warnings;
-                });
+            if !is_sliding && let Some(learned) = workers.install(|| self.solver.learn(frames, dark)) {
+                self.account.note(|film| note_findings(film, learned));
+                self.account.summary().warnings.iter().for_each(|warning| tracing::warn!("{warning}"));
             }
         }
         Ok(())
