@@ -156,7 +156,7 @@ fn a_session_resumed_from_any_line_of_its_ledger_ends_with_the_same_bits() {
     }
 }
 
-/// The only exception: with overlapped readout, the edge that lights a point's last frame may already trigger the next
+/// An exception: with overlapped readout, the edge that lights a point's last frame may already trigger the next
 /// point's first frame, and which point is next depends on the interruption. If no such edge is missed, attempts and
 /// frames are nevertheless the same, and so is the delay of every frame but the last.
 #[test]
@@ -181,6 +181,8 @@ fn light_that_the_next_point_triggers_changes_the_last_delay_of_a_point_and_no_m
                 let last = was.delays_us.len().saturating_sub(1);
                 assert_eq!(was.delays_us[..last], is.delays_us[..last], "{what}");
                 differing += usize::from(was.delays_us != is.delays_us);
+                // Where that delay is the same, so are the counts.
+                assert!(was.delays_us != is.delays_us || was.crc32 == is.crc32, "{what}");
             }
         }
     }
@@ -248,10 +250,13 @@ fn sigterm_ends_a_run_in_order_and_keeps_what_was_acquired() {
     let mut daemon = Daemon::start(folder.path());
     let events = daemon.client().subscribe().unwrap();
     daemon.client().run(&plan(&PLAN.replace("average = 2", "average = 20"))).unwrap();
-    let mut finished = None;
+    let (mut is_asked, mut finished) = (false, None);
     for event in events {
         match event.unwrap() {
-            Event::Progress(progress) if progress.points_stored == 6 => daemon.terminate(),
+            Event::Progress(progress) if !is_asked && progress.points_stored >= 2 => {
+                daemon.terminate();
+                is_asked = true;
+            }
             Event::Finished { session, state, .. } => {
                 finished = Some((session, state));
                 break;
@@ -263,7 +268,7 @@ fn sigterm_ends_a_run_in_order_and_keeps_what_was_acquired() {
     assert_eq!(state, "cancelled");
     assert!(daemon.process.wait().success());
     let state = stored(&session).unwrap();
-    assert!(state.stored(ArrayName::Dark).count() + state.stored(ArrayName::Sum).count() >= 5);
+    assert!(state.stored(ArrayName::Dark).count() + state.stored(ArrayName::Sum).count() >= 1);
     assert!(state.counts.balanced(), "{:?}", state.counts);
     let resumed = {
         let mut daemon = Daemon::start(folder.path());

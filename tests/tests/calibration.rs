@@ -173,8 +173,10 @@ fn an_interrupted_calibration_is_resumed_to_the_same_bits() {
     let arrays = fs::read(whole.session.join("calibration.npz")).unwrap();
     let header = kept(&whole.session).header;
     let lines: Vec<String> = fs::read_to_string(&ledger).unwrap().lines().map(Into::into).collect();
-    // In the dark images, in the pictures, between the two steps whose settings depend on them.
-    for end in [20, lines.len() / 3, lines.len() - 150, lines.len() - 60] {
+    // In the dark images, in the black pictures of both exposures, in the other pictures, between the two steps whose
+    // settings depend on them.
+    let black = lines.iter().position(|line| line.contains("\"sum\"")).unwrap();
+    for end in [20, black + 9, black + 20, lines.len() / 3, lines.len() - 150, lines.len() - 60] {
         fs::write(&ledger, lines[..end].join("\n") + "\n").unwrap();
         fs::remove_file(whole.session.join("calibration.npz")).unwrap();
         let resumed = bench.resume(&whole.session);

@@ -34,13 +34,18 @@ fn swept(ambient: &str) -> (Bench, Ended, f64) {
     let bench = Bench::new(&corner_rig(ambient).replace("rows = 128", "rows = 720"));
     let ended = bench.run(SWEEP);
     assert_eq!(ended.state, "complete", "{:?}", ended.error);
+    let error = error_of(&bench, &ended);
+    (bench, ended, error)
+}
+
+/// The median relative error of a session's T.
+fn error_of(bench: &Bench, ended: &Ended) -> f64 {
     let rig = Rig::load(&bench.folder.path().join("rig.toml")).unwrap();
     let found: Array3<f32> = ndarray_npy::read_npy(ended.session.join("products/transport.npy")).unwrap();
     let u_min = metadata(&ended.session)["u_min"].as_i64().unwrap();
     let found = found.slice(s![(-94 - u_min) as usize..=(94 - u_min) as usize, .., ..]);
     let scene = rig.simulated().unwrap().scene().transport.index_axis(Axis(3), 0).to_owned();
-    let error = median_profile_error(found, relative_rows(scene.view(), &(-94..=94)).view());
-    (bench, ended, error)
+    median_profile_error(found, relative_rows(scene.view(), &(-94..=94)).view())
 }
 
 #[test]
@@ -48,7 +53,7 @@ fn a_lamp_that_flickers_does_no_more_harm_than_a_steady_one() {
     let (bench, ended, steady) = swept(STEADY);
     assert_eq!(metadata(&ended.session)["findings"]["room light"], serde_json::Value::Null);
     drop(bench);
-    let (_bench, ended, flickering) = swept(FLICKERING);
+    let (bench, ended, flickering) = swept(FLICKERING);
     let said = metadata(&ended.session)["findings"]["room light"].as_str().unwrap().to_owned();
     println!("error of T: {steady:.4} steady, {flickering:.4} flickering; {said}");
     // Measured: 0.0148 and 0.0153; without the correction 0.066.
@@ -70,6 +75,20 @@ fn a_lamp_that_flickers_does_no_more_harm_than_a_steady_one() {
     let transport = fs::read(ended.session.join("products/transport.npy")).unwrap();
     raysweep_processing::process(session.dir()).unwrap();
     assert!(fs::read(ended.session.join("products/transport.npy")).unwrap() == transport);
+
+    // Interrupted, it sees the lamp at other times: other bits, the same accuracy, and processing agrees with the run.
+    let ledger = session.ledger_path();
+    let lines: Vec<String> = fs::read_to_string(&ledger).unwrap().lines().map(Into::into).collect();
+    fs::write(&ledger, lines[..lines.len() / 2].join("\n") + "\n").unwrap();
+    let resumed = bench.resume(&ended.session);
+    assert_eq!(resumed.state, "complete", "{:?}", resumed.error);
+    let again = fs::read(ended.session.join("products/transport.npy")).unwrap();
+    assert!(again != transport, "there is no exception any more: ARCHITECTURE.md says that there is");
+    let interrupted = error_of(&bench, &ended);
+    println!("error of T, interrupted: {interrupted:.4}");
+    assert!(interrupted < 1.15 * steady, "{steady} steady, {interrupted} flickering and interrupted");
+    raysweep_processing::process(session.dir()).unwrap();
+    assert!(fs::read(ended.session.join("products/transport.npy")).unwrap() == again);
 }
 
 /// Pictures of three frames, which cancel 100 Hz.

@@ -119,8 +119,8 @@ pub fn raysweep(arguments: &[&str], session: &Path) -> Output {
 
 pub fn command(arguments: &[&str], session: &Path) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_raysweep"));
-    // Without video encoders, whose files differ from time to time.
-    command.args(arguments).arg(session).env("PATH", "/nonexistent").env("RAYON_NUM_THREADS", "2");
+    // Without video encoders, whose files differ from time to time, and with other threads than the daemon's.
+    command.args(arguments).arg(session).env("PATH", "/nonexistent").env("RAYON_NUM_THREADS", "3");
     command
 }
 
@@ -129,10 +129,9 @@ pub fn text(output: &Output) -> String {
     format!("{} {}{}", output.status, text(&output.stdout), text(&output.stderr))
 }
 
-/// All files of a folder but those that tell of times and those that a crash leaves behind. A calibration depends on the
-/// times of the frames that show the room's light, of one run alone.
+/// All files of a folder but those that tell of times and those that a crash leaves behind.
 pub fn files_of(folder: &Path) -> Files {
-    let timed = ["ledger.jsonl", "report.html", "manifest.json", "calibration.toml", "calibration.npz"];
+    let timed = ["ledger.jsonl", "report.html", "manifest.json", "calibration.toml"];
     let mut files = Files::new();
     let mut folders = vec![folder.to_owned()];
     while let Some(inner) = folders.pop() {
@@ -153,7 +152,8 @@ pub fn files_of(folder: &Path) -> Files {
 /// Those of the files that are made from the data.
 pub fn results_of(folder: &Path) -> Files {
     let mut files = files_of(folder);
-    files.retain(|name, _| name.starts_with("products/") || name.starts_with("transport"));
+    let results = ["products/", "transport", "calibration.npz"];
+    files.retain(|name, _| results.iter().any(|result| name.starts_with(result)));
     files
 }
 

@@ -1,6 +1,6 @@
 //! A session that nothing interrupted, and kills whose outcomes are compared with it.
 
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -28,8 +28,8 @@ pub struct Reference<'a> {
     folder: TempDir,
     /// Away from the data folder.
     session: PathBuf,
-    run_time: Duration,
-    process_time: Duration,
+    run_time: Usual,
+    process_time: Usual,
     /// What was stored, in the order of the lines.
     stored: Vec<Stored>,
     files: Files,
@@ -37,6 +37,24 @@ pub struct Reference<'a> {
     results: [Files; 2],
     /// What is made of the first lines of the ledger, by their number.
     made: RefCell<BTreeMap<usize, Option<Files>>>,
+}
+
+/// How long something takes, which changes with the load of the machine.
+struct Usual {
+    now: Cell<Duration>,
+    at_most: Duration,
+}
+
+impl Usual {
+    fn new(took: Duration) -> Self {
+        Self { now: Cell::new(took), at_most: took }
+    }
+
+    /// About one kill in twelve comes after the end.
+    fn learn(&self, verdict: &Verdict) {
+        let factor = if verdict.within { 1.02 } else { 0.8 };
+        self.now.set(self.now.get().mul_f64(factor).min(self.at_most));
+    }
 }
 
 /// When something is killed.
@@ -69,12 +87,13 @@ impl<'a> Reference<'a> {
         fs::remove_dir_all(&made).unwrap();
         let (stored, files) = (stored(&session), files_of(&session));
         let made = RefCell::default();
-        let (process_time, results) = (Duration::ZERO, [results_of(&session), Files::new()]);
+        let (run_time, process_time) = (Usual::new(run_time), Usual::new(Duration::ZERO));
+        let results = [results_of(&session), Files::new()];
         let new = Self { kind, folder, session, run_time, process_time, stored, files, results, made };
         let processed = new.to_be_processed();
         let began = Instant::now();
         new.process(&processed).unwrap();
-        let process_time = began.elapsed();
+        let process_time = Usual::new(began.elapsed());
         let results = [new.results[0].clone(), results_of(&processed)];
         assert_eq!(results[0] != results[1], kind.edit.is_some(), "{}", kind.name);
         Self { process_time, results, ..new }
@@ -85,14 +104,14 @@ impl<'a> Reference<'a> {
     }
 
     /// Up to a little after the end, or after a line of the ledger.
-    fn moment(&self, random: &mut Xoshiro256PlusPlus, time: Duration, lines: usize) -> Moment {
+    fn moment(&self, random: &mut Xoshiro256PlusPlus, time: &Usual, lines: usize) -> Moment {
         let share = (random.next_u64() >> 11) as f64 / (1_u64 << 53) as f64;
         match random.next_u64() % 2 {
             1 if lines > 0 => {
                 let later = Duration::from_micros(random.next_u64() % 3000);
                 Moment::Line(1 + (share * lines as f64) as usize, later)
             }
-            _ => Moment::After(time.mul_f64(share * 1.05)),
+            _ => Moment::After(time.now.get().mul_f64(share * 1.05)),
         }
     }
 
@@ -122,8 +141,10 @@ impl<'a> Reference<'a> {
     /// Kills a run.
     pub fn kill_a_run(&self, random: &mut Xoshiro256PlusPlus) -> (Verdict, String) {
         let lines = fs::read_to_string(self.session.join("ledger.jsonl")).unwrap().lines().count();
-        let moment = self.moment(random, self.run_time, lines);
-        self.kill_daemon(&moment, |client| drop(client.run(&plan(self.kind.plan))))
+        let moment = self.moment(random, &self.run_time, lines);
+        let (verdict, when) = self.kill_daemon(&moment, |client| drop(client.run(&plan(self.kind.plan))));
+        self.run_time.learn(&verdict);
+        (verdict, when)
     }
 
     /// Kills a run that resumes a session.
@@ -134,8 +155,9 @@ impl<'a> Reference<'a> {
         let session = self.data().join(self.session.file_name().unwrap());
         copy(&self.session, &session);
         cut(&session, &lines[..kept].concat());
-        let moment = self.moment(random, self.run_time, 0);
+        let moment = self.moment(random, &self.run_time, 0);
         let (verdict, when) = self.kill_daemon(&moment, |client| drop(client.resume(&session)));
+        self.run_time.learn(&verdict);
         (verdict, format!("resumed after line {kept}, {when}"))
     }
 
@@ -255,11 +277,12 @@ impl<'a> Reference<'a> {
     /// Kills `raysweep process` of the complete session.
     pub fn kill_processing(&self, random: &mut Xoshiro256PlusPlus) -> (Verdict, String) {
         let session = self.to_be_processed();
-        let moment = self.moment(random, self.process_time, 0);
+        let moment = self.moment(random, &self.process_time, 0);
         let mut processing = command(&["process", "--accept-edits"], &session);
         let mut processing = Process::start(processing.stdout(Stdio::null()).stderr(Stdio::null()));
         self.wait(&moment, || Some(session.clone()));
         let mut verdict = Verdict { within: !processing.has_ended(), ..Verdict::default() };
+        self.process_time.learn(&verdict);
         drop(processing);
         verdict.read(&session);
         verdict.keeps(&self.stored, &stored(&session));

@@ -2,12 +2,11 @@
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::time::{Duration, Instant};
 
 use nix::sys::signal::Signal;
 use raysweep_proto::{Client, Event, RunParams};
 
-use crate::process::Process;
+use crate::process::{Process, wait_for};
 
 /// A system call that changed a folder, or made a change durable. Paths are absolute.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -89,14 +88,11 @@ pub fn record(folder: &Path, plan: &str) -> (Vec<Recorded>, PathBuf) {
         .stderr(std::process::Stdio::null());
     let mut daemon = Process::start(&mut command);
     let client = || Client::connect(&socket).ok();
-    let began = Instant::now();
-    let mut watcher = loop {
-        if let Some(client) = client() {
-            break client.subscribe().unwrap();
-        }
-        assert!(!daemon.has_ended() && began.elapsed() < Duration::from_secs(60), "no daemon under strace");
-        std::thread::sleep(Duration::from_millis(2));
-    };
+    let watcher = wait_for("the daemon does not listen under strace", || {
+        assert!(!daemon.has_ended(), "the daemon has ended");
+        client()
+    });
+    let mut watcher = watcher.subscribe().unwrap();
     client().unwrap().run(&RunParams { plan: plan.into(), ..RunParams::default() }).unwrap();
     let session = watcher.find_map(|event| match event.unwrap() {
         Event::Finished { session, state, error, .. } => {
@@ -108,15 +104,10 @@ pub fn record(folder: &Path, plan: &str) -> (Vec<Recorded>, PathBuf) {
     daemon.signal(Signal::SIGTERM);
     assert!(daemon.wait().success());
     // The trace is whole when it tells of the daemon's exit.
-    let began = Instant::now();
-    let text = loop {
+    let text = wait_for("strace has not ended", || {
         let text = std::fs::read_to_string(&trace).unwrap();
-        if text.ends_with("+++ exited with 0 +++\n") {
-            break text;
-        }
-        assert!(began.elapsed() < Duration::from_secs(60), "strace has not ended");
-        std::thread::sleep(Duration::from_millis(5));
-    };
+        text.ends_with("+++ exited with 0 +++\n").then_some(text)
+    });
     (calls(&text, &data), session.expect("a run that ended"))
 }
 

@@ -488,7 +488,7 @@ pub const TABLE: &[(&str, &[Row])] = &[
     ("Process", &[
         [
             "SIGKILL at any moment of a run, or of a resumed run",
-            "sweeps, darks and calibrations are resumed, the others processed, to the same bits",
+            "sweeps, darks, patterns and calibrations are resumed, the others processed, to the same bits",
             "kept",
             "daemon/tests/kills/main.rs",
             "random_kills_lose_nothing_and_change_no_bit",

@@ -10,6 +10,7 @@ use raysweep_transport::plane::board::Estimate;
 use raysweep_transport::plane::board::images::{
     Ambient, BlackFrames, CappedFrames, CodedPictures, DarkFit, ImagesError, LightLevel, Linearity, Phases,
     PhotonTransfer, Responses, RowPlaces, SensorNoise, WhiteMap, ambient, locate_rows, photon_transfer, prnu,
+    steady,
 };
 use raysweep_transport::plane::board::times::{BoardFrame, CoarseSweep, Columns, RowTimes, TimesError};
 use raysweep_transport::plane::{NoiseModel, PlaneError};
@@ -163,17 +164,18 @@ impl BoardImages<'_> {
         Ok(frames)
     }
 
-    /// The frames of a purpose that one run took, with the start of each exposure in s; none if it was not stored.
+    /// The frames of a purpose whose start was stored, those of one run or all, with the start of each exposure in s.
     fn timed_frames(
         &self,
         purpose: BoardPurpose,
-        run: u32,
+        run: Option<u32>,
     ) -> Result<(Array3<f32>, Vec<f64>), CalibrationError> {
         let (rows, columns) = (self.task.task.geometry.height, self.task.task.geometry.width);
         let (mut frames, mut opened_s) = (Array3::zeros((0, rows, columns)), Vec::new());
         for ordinal in self.task.ordinals(purpose) {
             let (image, entry) = self.image(ordinal)?;
-            if let Some(FrameStarts { starts_ns, .. }) = entry.exposed.as_ref().filter(|of| of.run == run)
+            if let Some(FrameStarts { starts_ns, .. }) =
+                entry.exposed.as_ref().filter(|of| run.is_none_or(|run| of.run == run))
                 && let [start_ns] = starts_ns[..]
             {
                 let shaped = |error: ndarray::ShapeError| CalibrationError::Image(error.to_string());
@@ -370,7 +372,24 @@ fn flickers(room: &Ambient, pass_dn: f64) -> bool {
     level * flicker.share.value * most_us > STEADY_SHARE * pass_dn
 }
 
-/// The room's light, from the black pictures of both exposures.
+/// Black pictures of both exposures: frames, the start of each in s, the exposure in us, and its dark image.
+type BlackPictures = [((Array3<f32>, Vec<f64>), f64, Array2<f32>); 2];
+
+fn has_enough(taken: &BlackPictures) -> bool {
+    taken.iter().all(|((_, opened_s), ..)| opened_s.len() >= LEAST_AMBIENT_FRAMES)
+}
+
+fn black_frames(taken: &BlackPictures) -> [BlackFrames<'_>; 2] {
+    taken.each_ref().map(|((frames, opened_s), exposure_us, dark_dn)| BlackFrames {
+        exposure_us: *exposure_us,
+        frames: frames.view(),
+        dark_dn: dark_dn.view(),
+        opened_s,
+    })
+}
+
+/// The room's light, from the black pictures of both exposures: its flicker by the clock of one run, and a level without
+/// flicker from all frames, however many runs took them.
 fn room(
     images: &BoardImages<'_>,
     dark: &DarkFit,
@@ -379,26 +398,29 @@ fn room(
 ) -> Result<Option<(Ambient, u32)>, CalibrationError> {
     let Some(run) = images.run_of_ambient() else { return Ok(None) };
     let exposures = [(BoardPurpose::Black, WHOLE_US), (BoardPurpose::Ambient, AMBIENT_US)];
-    let [black, short] = exposures.map(|(purpose, exposure_us)| {
-        let (frames, opened_s) = images.timed_frames(purpose, run)?;
-        let frames = (curve.straightened(frames, dark), opened_s);
-        Ok::<_, CalibrationError>((frames, exposure_us, dark.image(exposure_us)))
-    });
-    let taken = [black?, short?];
-    if taken.iter().any(|((_, opened_s), ..)| opened_s.len() < LEAST_AMBIENT_FRAMES) {
-        return Ok(None);
+    let taken = |run: Option<u32>| {
+        let [black, short] = exposures.map(|(purpose, exposure_us)| {
+            let (frames, opened_s) = images.timed_frames(purpose, run)?;
+            let frames = (curve.straightened(frames, dark), opened_s);
+            Ok::<_, CalibrationError>((frames, exposure_us, dark.image(exposure_us)))
+        });
+        Ok::<_, CalibrationError>([black?, short?])
+    };
+    let of_run = taken(Some(run))?;
+    if has_enough(&of_run) {
+        let usable = dark.hot.mapv(|hot| !hot);
+        let geometry = &images.task.task.geometry;
+        let (row_time_us, rate_hz) = (geometry.camera_row_time_us, 1e6 / geometry.raster.period_us);
+        let found = ambient(&black_frames(&of_run), row_time_us, rate_hz, noise, Some(usable.view()))?;
+        if found.flicker.is_some() {
+            return Ok(Some((found, run)));
+        }
     }
-    let runs = taken.each_ref().map(|((frames, opened_s), exposure_us, dark_dn)| BlackFrames {
-        exposure_us: *exposure_us,
-        frames: frames.view(),
-        dark_dn: dark_dn.view(),
-        opened_s,
-    });
-    let usable = dark.hot.mapv(|hot| !hot);
-    let geometry = &images.task.task.geometry;
-    let rate_hz = 1e6 / geometry.raster.period_us;
-    let found = ambient(&runs, geometry.camera_row_time_us, rate_hz, noise, Some(usable.view()))?;
-    Ok(Some((found, run)))
+    let of_all = taken(None)?;
+    match has_enough(&of_all) {
+        true => Ok(Some((steady(&black_frames(&of_all), noise)?, run))),
+        false => Ok(None),
+    }
 }
 
 fn dark(images: &BoardImages<'_>) -> Result<DarkFit, CalibrationError> {

@@ -103,6 +103,16 @@ pub fn ambient(
     Ok(ambient)
 }
 
+/// Level of the room's light from frames whose times are not needed: those of lamps that do not flicker.
+///
+/// # Errors
+/// [`ImagesError::TooFew`] for runs of fewer than 8 frames; [`ImagesError::Shape`]; [`ImagesError::OutOfRange`].
+pub fn steady(runs: &[BlackFrames], noise: SensorNoise) -> Result<Ambient, ImagesError> {
+    noise.check()?;
+    check_frames_of(runs)?;
+    Ok(level(runs, noise, |_, _, _| 0.0))
+}
+
 impl Ambient {
     /// Median level as a share of white, in the time of one projector row.
     pub fn level_of_white(&self, white_dn: f64, row_time_us: f64) -> f64 {
@@ -152,6 +162,11 @@ fn check(runs: &[BlackFrames], camera_row_time_us: f64, frame_rate_hz: f64) -> R
     let positive = |value: f64| value.is_finite() && value > 0.0;
     check_range("camera_row_time_us", camera_row_time_us, positive(camera_row_time_us), "positive")?;
     check_range("frame_rate_hz", frame_rate_hz, positive(frame_rate_hz), "positive")?;
+    check_frames_of(runs)
+}
+
+fn check_frames_of(runs: &[BlackFrames]) -> Result<(), ImagesError> {
+    let positive = |value: f64| value.is_finite() && value > 0.0;
     let frames: usize = runs.iter().map(|run| run.frames.len_of(Axis(0))).sum();
     check_frames(frames, 8)?;
     for run in runs {

@@ -18,7 +18,7 @@ mod response;
 mod smooth;
 mod white;
 
-pub use ambient::{Ambient, BlackFrames, Flicker, ambient};
+pub use ambient::{Ambient, BlackFrames, Flicker, ambient, steady};
 pub use dark::{CappedFrames, DarkFit};
 pub use error::ImagesError;
 pub use linearity::{LightLevel, Linearity, MOST_BEND, SaturationLimit};
