@@ -1,9 +1,10 @@
 //! Converts the times of a device that cannot be asked for its time to the host's clock, by what arrives from it.
 //!
 //! What a device sends (the samples of an analyser, the frames of a camera) arrives after its time: by at least the
-//! latency of the bus, and by much more if the host was busy. So the least late arrival of each quarter of a second is
-//! used, as a round trip that ends at its time. If the host was busy for that whole time, the other quarters show how
-//! late even this one was: its round trip is lengthened by that time, and so its weight in the fit is reduced.
+//! latency of the bus, and by much more if the host was busy. So the least late arrival of each quarter of a second (at
+//! first, of shorter times) is used, as a round trip that ends at its time. If the host was busy for that whole time,
+//! the other quarters show how late even this one was: its round trip is lengthened by that time, and so its weight in
+//! the fit is reduced.
 
 use std::collections::VecDeque;
 
@@ -66,8 +67,7 @@ impl ArrivalClock {
         if lateness((device_ns, host_ns)) <= lateness(window.best) {
             window.best = (device_ns, host_ns);
         }
-        let windows = self.model.quality().map_or(0, |quality| quality.round_trips);
-        if host_ns - window.began_ns >= WINDOW_NS[usize::from(windows >= SHORT_WINDOWS)] {
+        if host_ns - window.began_ns >= WINDOW_NS[usize::from(self.best.len() >= SHORT_WINDOWS)] {
             let (device_ns, arrived_ns) = window.best;
             if self.best.len() == WINDOWS {
                 self.best.pop_front();

@@ -1,5 +1,6 @@
 //! The daemon as a child process, for the commands that need one.
 
+use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command};
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -55,9 +56,9 @@ impl Daemon {
     fn wait(&mut self) -> Done {
         let socket = self.socket();
         let began = Instant::now();
-        while !socket.exists() {
+        while UnixStream::connect(&socket).is_err() {
             if let Ok(Some(status)) = self.process.try_wait() {
-                return Err(format!("raysweepd ended with {status}; its message stands above"));
+                return Err(format!("raysweepd ended with {status}; see its message above"));
             }
             if began.elapsed() > START_TIMEOUT {
                 return Err(format!("raysweepd does not listen on {}", socket.display()));

@@ -1,5 +1,5 @@
-//! `cargo xtask demo | test | packages | fresh | deb | guest | soak | bench`: the project's own commands. Uses only std, so that it
-//! builds quickly everywhere.
+//! `cargo xtask demo | test | packages | fresh | deb | guest | soak | bench`: the project's own commands. Uses only
+//! std, so that it builds quickly everywhere.
 
 mod bench;
 mod daemon;
@@ -29,9 +29,10 @@ usage: cargo xtask <command>
   fresh [12|13]...   runs demo and test of the last commit on a bare Debian 12 and 13, or on one
   deb                builds the Debian package and prints its path
   guest [TEST...]    the drivers' tests against real kernel drivers in a QEMU guest, or some of them
-  guest --systemd    the package under systemd in a QEMU guest: installed, used, killed, cut off from power
-  soak [--minutes N] all procedures with faults, bad clients and kills for 20 minutes, or as many as given; a report with
-                     what grew, differed or got lost
+  guest --systemd    the package under systemd in a QEMU guest: installed, used, killed, cut off from power; not
+                     part of `test`, and one of its checks still fails
+  soak [--minutes N] runs all procedures with faults, misbehaving clients and kills for 20 minutes, or N; reports
+                     growth, differences and losses
   bench [NAME]       measures; without a name, tells which benchmarks there are";
 
 fn main() -> ExitCode {

@@ -1,7 +1,9 @@
 //! `cargo xtask test`: all checks.
 
+use std::process::Command;
+
 use crate::run::{Done, cargo, run, target};
-use crate::{guest, packages, python};
+use crate::{guest, packages, python, rootfs};
 
 /// Whether to run the tests in the kernel guest.
 #[derive(Clone, Copy, PartialEq)]
@@ -13,6 +15,7 @@ pub enum Guest {
 /// Installs missing packages, then checks format, lints, fuzz targets, tests, doc tests, and tests in the kernel guest.
 pub fn test(wanted: Guest) -> Done {
     has_components()?;
+    has_networks()?;
     packages::install()?;
     // Packages that read our files in practice.
     let python = python::environment("python", "requirements.txt")?;
@@ -28,6 +31,27 @@ pub fn test(wanted: Guest) -> Done {
             println!("{}", guest::skipped());
             Ok(())
         }
+    }
+}
+
+/// Fails, before anything is installed or built, where tests cannot have networks of their own, in which simulated
+/// cameras use the ports and the discovery of real ones.
+fn has_networks() -> Done {
+    let Err(error) = unshare_network() else { return Ok(()) };
+    let remedy = if rootfs::is_root() {
+        "permit it, as containers do with `--cap-add SYS_ADMIN`"
+    } else {
+        "be root: sudo env \"PATH=$PATH\" \"HOME=$HOME\" cargo xtask test"
+    };
+    Err(format!("the tests need networks of their own, and `unshare --net` fails here ({error}); {remedy}"))
+}
+
+fn unshare_network() -> Done {
+    let tried = Command::new("unshare").args(["--net", "true"]).output();
+    let output = tried.map_err(|error| error.to_string())?;
+    match output.status.success() {
+        true => Ok(()),
+        false => Err(String::from_utf8_lossy(&output.stderr).trim().to_owned()),
     }
 }
 

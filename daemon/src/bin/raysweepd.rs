@@ -132,15 +132,16 @@ fn prepare_data(folder: &Path) -> std::io::Result<()> {
 }
 
 async fn serve(arguments: &DaemonArguments, runner: Arc<Runner>) -> Result<(), Box<dyn std::error::Error>> {
+    // Before anybody can reach the daemon.
+    let mut terminate = signal(SignalKind::terminate())?;
+    let mut interrupt = signal(SignalKind::interrupt())?;
+    let mut hangup = signal(SignalKind::hangup())?;
+    let retire = signal(SignalKind::user_defined1())?;
     let Listening { listener, file } = match Listening::inherited()? {
         Some(listening) => listening,
         None => Listening::bind(&arguments.socket)?,
     };
     tracing::info!("listening on {}", listening_on(&listener, &arguments.socket).display());
-    let mut terminate = signal(SignalKind::terminate())?;
-    let mut interrupt = signal(SignalKind::interrupt())?;
-    let mut hangup = signal(SignalKind::hangup())?;
-    let retire = signal(SignalKind::user_defined1())?;
     let watchdog = tokio::spawn(feed_watchdog(runner.clone()));
     let _ = sd_notify::notify(&[NotifyState::Ready]);
     let ended = {

@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
+use crate::packages::apt;
 use crate::rootfs;
 use crate::run::{Done, run};
 
@@ -100,7 +101,8 @@ fn download(folder: &Path) -> Done<PathBuf> {
                  packages fresh?\n  sudo apt-get update"
             ));
         }
-        run(Command::new("apt-get").arg("update").stdout(Stdio::null()))?;
+        // Lists that are only partly updated may be sufficient.
+        let _ = apt::update();
         download_package(&package_name()?, folder)
     });
     fetched.and_then(|()| only_entry(folder, ".deb")).map(|file| folder.join(file))
@@ -109,6 +111,8 @@ fn download(folder: &Path) -> Done<PathBuf> {
 fn package_name() -> Done<String> {
     let output = Command::new("apt-cache")
         .args(["depends", META_PACKAGE])
+        // The output is parsed below, so it must not be translated.
+        .env("LC_ALL", "C")
         .output()
         .map_err(|error| format!("cannot start apt-cache: {error}"))?;
     let text = String::from_utf8_lossy(&output.stdout);

@@ -94,7 +94,7 @@ fn build(tests: &[&GuestTest]) -> Done<Vec<Executable>> {
     let output =
         build.stderr(Stdio::inherit()).output().map_err(|error| format!("cannot start cargo: {error}"))?;
     if !output.status.success() {
-        return Err("the guest's tests do not build; the compiler's messages stand above".to_owned());
+        return Err("the guest's tests do not build; see the compiler's messages above".to_owned());
     }
     let messages = String::from_utf8_lossy(&output.stdout);
     let built = |test, name, path: Option<PathBuf>, what: &str| {

@@ -53,6 +53,8 @@ pub fn by_hand(names: &[String], is_root: bool) -> String {
 
 fn apt_get(arguments: &[&str]) -> Done {
     let mut apt = Command::new("apt-get");
+    // A machine that has just started updates itself, and downloads can fail once.
+    apt.args(["-o", "DPkg::Lock::Timeout=600", "-o", "Acquire::Retries=3"]);
     run(apt.args(arguments).env("DEBIAN_FRONTEND", "noninteractive").stdout(Stdio::null()))
 }
 

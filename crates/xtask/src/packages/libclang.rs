@@ -64,7 +64,7 @@ fn llvm_folders() -> Done<Vec<PathBuf>> {
     match Command::new(&program).arg("--prefix").output() {
         Ok(output) if output.status.success() => folders_below(&String::from_utf8_lossy(&output.stdout))
             .ok_or_else(|| {
-                format!("`{} --prefix` prints nothing, on which clang-sys fails", program.display())
+                format!("`{} --prefix` prints nothing; clang-sys fails on that", program.display())
             }),
         _ => Ok(Vec::new()),
     }

@@ -42,7 +42,7 @@ fn parse(bytes: &[u8]) -> Done<Vec<PackageEntry>> {
         }
         let entry = entry(line).map_err(failed)?;
         if let Some(name) = entry.names.iter().find(|name| entries.iter().any(|it| it.names.contains(name))) {
-            return Err(failed(format!("package: `{name}` stands in an earlier line too: expected it once")));
+            return Err(failed(format!("package `{name}` is listed twice")));
         }
         entries.push(entry);
     }
@@ -65,7 +65,7 @@ fn entry(line: &str) -> Done<PackageEntry> {
     })?;
     let names = names.split('|').map(package).collect::<Done<Vec<_>>>()?;
     if names.iter().enumerate().any(|(index, name)| names[..index].contains(name)) {
-        return Err(format!("package: `{}` has a name twice: expected each once", names.join("|")));
+        return Err(format!("package `{}` repeats a name", names.join("|")));
     }
     let probes = probes.split(',').map(Probe::parse).collect::<Done<_>>();
     let probes = probes.map_err(|error| format!("what shows that it is there: {error}"))?;
@@ -103,8 +103,8 @@ mod tests {
             ("a||b cc why", "package: ``: expected"),
             ("-y cc why", "package: `-y`: expected"),
             ("Gcc cc why", "package: `Gcc`: expected"),
-            ("a|a cc why", "package: `a|a` has a name twice"),
-            ("x|other cc why", "package: `other` stands in an earlier line"),
+            ("a|a cc why", "package `a|a` repeats a name"),
+            ("x|other cc why", "package `other` is listed twice"),
             ("a nonsense:x why", "what shows that it is there: `nonsense:x`"),
             ("a b, why", "what shows that it is there: ``"),
             ("\u{feff}a b why", "byte order mark"),

@@ -1,6 +1,6 @@
 //! System packages that the tests need: a list in the project, installed if permitted.
 
-mod apt;
+pub mod apt;
 mod elf;
 mod libclang;
 mod list;
@@ -107,8 +107,7 @@ fn by_hand(missing: &[Missing], known: &[String], is_root: bool) -> String {
     let mut said = format!("install with\n  {}", apt::by_hand(&names, is_root));
     if !unknown.is_empty() {
         said += &format!(
-            "\napt's lists do not have these yet, by any name:\n{}\nif they still lack one after the update, run this again for \
-             the name that they have\n{ELSEWHERE}",
+            "\napt does not know these packages yet, by any name:\n{}\nafter the update, run this command again\n{ELSEWHERE}",
             lines(unknown)
         );
     }
@@ -128,7 +127,7 @@ fn still_missing(missing: &[Missing]) -> Done {
         return Ok(());
     }
     Err(format!(
-        "these packages are installed, yet what {PATH} has them for is not found:\n{}",
+        "installed, but what they are needed for is still not found ({PATH} says how it is looked for):\n{}",
         lines(missing)
     ))
 }
