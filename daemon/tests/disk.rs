@@ -8,10 +8,9 @@ mod process;
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::time::{Duration, Instant};
 
 use outcome::{Outcome, outcome};
-use process::Process;
+use process::{Process, wait_for};
 use raysweep_proto::{Client, Event, RunParams, RunState};
 use tempfile::TempDir;
 
@@ -64,15 +63,11 @@ impl Begun {
 
     /// A client that has subscribed, and another one.
     fn clients(folder: &Path, daemon: &mut Process) -> (impl Iterator<Item = Event> + use<>, Client) {
-        let began = Instant::now();
         let socket = folder.join("socket");
-        let client = loop {
-            match Client::connect(&socket) {
-                Ok(client) => break client,
-                Err(_) => assert!(!daemon.has_ended() && began.elapsed() < Duration::from_secs(60)),
-            }
-            std::thread::sleep(Duration::from_millis(2));
-        };
+        let client = wait_for("the daemon does not listen", || {
+            assert!(!daemon.has_ended(), "the daemon has ended");
+            Client::connect(&socket).ok()
+        });
         (client.subscribe().unwrap().map(Result::unwrap), Client::connect(&socket).unwrap())
     }
 
@@ -195,7 +190,7 @@ fn a_film_on_a_full_disk_is_held_between_two_cycles_and_loses_none() {
         let stamp = begins.to_zoned(jiff::tz::TimeZone::UTC).strftime("%Y%m%d-%H%M%S").to_string();
         folder.path().join(format!("sessions/{stamp}_film/film.zarr/film/c.3.0.0.0.raysweep-tmp"))
     };
-    let files: Vec<PathBuf> = (0..60).map(stamp).collect();
+    let files: Vec<PathBuf> = (0..600).map(stamp).collect();
     let command = tampered("fsync:error=ENOSPC:when=1", &files);
     let mut daemon = Begun::daemon(folder.path(), command);
     let (events, mut client) = Begun::clients(folder.path(), &mut daemon);

@@ -12,7 +12,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::Signal;
-use process::Process;
+use process::{HUNG, Process, wait_for};
 use raysweep::control::Control;
 use raysweep::mirror::state_file;
 use raysweep::rig::AnyRig;
@@ -85,14 +85,7 @@ impl Lab {
     }
 
     fn client(&self) -> Client {
-        let began = Instant::now();
-        loop {
-            match Client::connect(self.socket()) {
-                Ok(client) => return client,
-                Err(error) => assert!(began.elapsed() < Duration::from_secs(60), "{error}\n{}", self.log()),
-            }
-            std::thread::sleep(Duration::from_millis(5));
-        }
+        wait_for("the daemon does not listen", || Client::connect(self.socket()).ok())
     }
 
     /// Starts a run and waits until the mirror has played a number of samples with light.
@@ -106,7 +99,7 @@ impl Lab {
         self.client().run(&params).unwrap();
         let began = Instant::now();
         while self.lit() < samples {
-            assert!(began.elapsed() < Duration::from_secs(60), "no light after a minute\n{}", self.log());
+            assert!(began.elapsed() < HUNG, "no light\n{}", self.log());
             std::thread::sleep(Duration::from_millis(5));
         }
         daemon
@@ -125,7 +118,7 @@ impl Lab {
             if matches!(status.state, RunState::Idle | RunState::Faulted) {
                 return (status.state, status.error);
             }
-            assert!(began.elapsed() < Duration::from_secs(60), "{status:?}");
+            assert!(began.elapsed() < HUNG, "{status:?}");
             std::thread::sleep(Duration::from_millis(5));
         }
     }
@@ -161,7 +154,7 @@ impl Lab {
             if let Some(parked) = parked {
                 break parked;
             }
-            assert!(began.elapsed() < Duration::from_secs(60), "{way}: not parked\n{}", self.log());
+            assert!(began.elapsed() < HUNG, "{way}: not parked\n{}", self.log());
             std::thread::sleep(Duration::from_millis(2));
         };
         assert!(dark_ns <= parked_ns);
@@ -182,7 +175,7 @@ impl Lab {
                 Ok(parked) => {
                     return assert_eq!(parked, Parked::Already, "somebody else has parked it before");
                 }
-                Err(error) => assert!(began.elapsed() < Duration::from_secs(60), "{error}"),
+                Err(error) => assert!(began.elapsed() < HUNG, "{error}"),
             }
         }
     }
@@ -262,7 +255,7 @@ fn underrun() {
     daemon.signal(Signal::SIGSTOP);
     let began = Instant::now();
     while lab.pty.look(|truth| truth.underruns == 0) {
-        assert!(began.elapsed() < Duration::from_secs(60), "the FIFO does not run dry");
+        assert!(began.elapsed() < HUNG, "the FIFO does not run dry");
         std::thread::sleep(Duration::from_millis(5));
     }
     let since_ns = now_ns();
@@ -345,7 +338,7 @@ fn panic_in_a_stage() {
     runner.run(RunParams { plan: plan(3), ..RunParams::default() }).unwrap();
     let began = Instant::now();
     while !matches!(runner.status().state, RunState::Idle | RunState::Faulted) {
-        assert!(began.elapsed() < Duration::from_secs(60), "{:?}", runner.status());
+        assert!(began.elapsed() < HUNG, "{:?}", runner.status());
         std::thread::sleep(Duration::from_millis(5));
     }
     let ended_ns = now_ns();

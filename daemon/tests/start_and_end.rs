@@ -11,7 +11,7 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::Signal;
-use process::Process;
+use process::{Process, wait_for};
 use raysweep_proto::{Client, RunParams, RunState};
 use raysweep_session::Session;
 use raysweep_session::ledger::EndState;
@@ -48,18 +48,7 @@ impl Lab {
     }
 
     fn client(&self) -> Client {
-        let began = Instant::now();
-        loop {
-            match Client::connect(self.path("socket")) {
-                Ok(client) => return client,
-                Err(error) => assert!(
-                    began.elapsed() < Duration::from_secs(60),
-                    "{error}\n{}",
-                    fs::read_to_string(self.path("log")).unwrap_or_default()
-                ),
-            }
-            std::thread::sleep(Duration::from_millis(5));
-        }
+        wait_for("the daemon does not listen", || Client::connect(self.path("socket")).ok())
     }
 
     fn session(&self) -> Session {
@@ -80,9 +69,7 @@ fn every_signal_that_asks_for_the_end_ends_a_run_in_order() {
         let mut daemon = lab.daemon_after("true");
         let mut client = lab.client();
         client.run(&RunParams { plan: PLAN.into(), ..RunParams::default() }).unwrap();
-        while client.status().unwrap().state != RunState::Running {
-            std::thread::sleep(Duration::from_millis(5));
-        }
+        running(&mut client);
         daemon.signal(signal);
         let began = Instant::now();
         assert!(daemon.wait().success(), "{signal}");
@@ -102,9 +89,7 @@ fn every_signal_that_asks_for_the_end_ends_a_run_in_order() {
 
 /// Waits until a run is under way.
 fn running(client: &mut Client) {
-    while client.status().unwrap().state != RunState::Running {
-        std::thread::sleep(Duration::from_millis(5));
-    }
+    wait_for("no run is under way", || (client.status().unwrap().state == RunState::Running).then_some(()));
 }
 
 #[test]
@@ -126,17 +111,13 @@ fn a_daemon_that_was_stopped_for_a_while_loses_frames_and_no_point() {
     let daemon = lab.daemon_after("true");
     let mut client = lab.client();
     // In real time: the camera goes on while the daemon stands still.
-    let short = PLAN.replace("4000", "20");
+    let short = PLAN.replace("4000", "200");
     client.run(&RunParams { plan: short, ..RunParams::default() }).unwrap();
     running(&mut client);
     daemon.signal(Signal::SIGSTOP);
     std::thread::sleep(Duration::from_millis(800));
     daemon.signal(Signal::SIGCONT);
-    let began = Instant::now();
-    while client.status().unwrap().state != RunState::Idle {
-        assert!(began.elapsed() < Duration::from_secs(60), "{:?}", client.status().unwrap());
-        std::thread::sleep(Duration::from_millis(20));
-    }
+    wait_for("the run does not end", || (client.status().unwrap().state == RunState::Idle).then_some(()));
     let state = lab.session().state().unwrap();
     assert_eq!((state.end.as_ref().unwrap().state, state.missing_points()), (EndState::Complete, 0));
     assert!(state.counts.balanced(), "{:?}", state.counts);

@@ -10,10 +10,10 @@ use std::os::unix::fs::MetadataExt;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use nix::sys::signal::Signal;
-use process::Process;
+use process::{Process, wait_for};
 use tempfile::TempDir;
 
 fn deploy() -> PathBuf {
@@ -148,15 +148,12 @@ fn an_unusable_rig_file_is_an_error_in_the_journal_with_an_exit_code_that_forbid
 fn log_lines_have_a_priority_and_no_time_and_an_idle_daemon_ends_on_request() {
     let folder = tempfile::tempdir().unwrap();
     let (mut daemon, log) = daemon(folder.path(), &deploy().join("rig.toml"));
-    let began = Instant::now();
-    while UnixStream::connect(folder.path().join("socket")).is_err() {
-        assert!(began.elapsed() < Duration::from_secs(120) && !daemon.has_ended());
-        std::thread::sleep(Duration::from_millis(20));
-    }
+    wait_for("the daemon does not listen", || {
+        assert!(!daemon.has_ended(), "the daemon has ended");
+        UnixStream::connect(folder.path().join("socket")).ok()
+    });
     // The signals are handled before the daemon listens to anybody.
-    while !fs::read_to_string(&log).unwrap().contains("listening") {
-        std::thread::sleep(Duration::from_millis(20));
-    }
+    wait_for("no word of it", || fs::read_to_string(&log).unwrap().contains("listening").then_some(()));
     std::thread::sleep(Duration::from_millis(200));
     daemon.signal(Signal::SIGUSR1);
     assert_eq!(daemon.wait().code(), Some(0));

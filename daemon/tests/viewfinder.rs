@@ -8,6 +8,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::Signal;
+use process::HUNG;
 use raysweep::Probes;
 use raysweep::Runner;
 use raysweep::control::Control;
@@ -27,9 +28,6 @@ use tokio::sync::broadcast::error::TryRecvError;
 const PLANE: &str = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver = \"sim\"\n[projector]\ndriver = \"sim\"\n\
                      [sim]\nscene = \"v-groove\"\nscene_rows = 96\nscene_columns = 96\nseed = 5\n\
                      [sim.board]\nprojector_columns = [0.40, 0.475]\n";
-
-/// How long a test waits for what must come.
-const PATIENCE: Duration = Duration::from_secs(60);
 
 /// A daemon's core with a viewfinder, and its events.
 struct View {
@@ -78,7 +76,7 @@ impl View {
                 Ok(event) => return event,
                 Err(TryRecvError::Lagged(_)) => {}
                 Err(TryRecvError::Empty) => {
-                    assert!(began.elapsed() < PATIENCE, "no event");
+                    assert!(began.elapsed() < HUNG, "no event");
                     std::thread::sleep(Duration::from_millis(1));
                 }
                 Err(TryRecvError::Closed) => panic!("the daemon's core has ended"),
@@ -93,7 +91,7 @@ impl View {
             match self.event() {
                 Event::Viewfinder(values) if holds(&values) => return *values,
                 Event::Finished { error, .. } => panic!("the viewfinder has ended: {error:?}"),
-                event => assert!(began.elapsed() < PATIENCE, "no such picture; {event:?}"),
+                event => assert!(began.elapsed() < HUNG, "no such picture; {event:?}"),
             }
         }
     }
@@ -367,11 +365,9 @@ impl Program {
         command.current_dir(&folder).args(["--rig", "rig.toml", "--socket", "socket", "--data", "sessions"]);
         let daemon = process::Process::start(command.stderr(Stdio::null()));
         let program = Self { folder, _daemon: daemon };
-        let began = Instant::now();
-        while !program.raysweep(&["status"]).status.success() {
-            assert!(began.elapsed() < PATIENCE, "the daemon does not answer");
-            std::thread::sleep(Duration::from_millis(10));
-        }
+        process::wait_for("the daemon does not answer", || {
+            program.raysweep(&["status"]).status.success().then_some(())
+        });
         program
     }
 

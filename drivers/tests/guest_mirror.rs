@@ -13,7 +13,7 @@ use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use guest::{Monitor, PATIENCE, wait_for};
+use guest::{Monitor, PATIENCE, PATIENCE as HUNG, wait_for};
 use nix::fcntl::OFlag;
 use raysweep_core::{DeviceErrorKind, Mirror, MirrorLimits, MirrorPath, Tilt};
 use raysweep_drivers::mirror::playzerx::protocol::MirrorSample;

@@ -2,12 +2,15 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
+#[path = "suite/hung.rs"]
+mod hung;
 #[path = "suite/noise.rs"]
 mod noise;
 
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use hung::HUNG;
 use raysweep_core::{Clock, DeviceErrorKind, Edge, Vsync};
 use raysweep_drivers::vsync::triggerbox::protocol::parse_reply;
 use raysweep_drivers::vsync::triggerbox::{TriggerBox, TriggerBoxConfig, TriggerBoxLink};
@@ -16,7 +19,6 @@ use raysweep_sim::triggerbox::TriggerBoxPty;
 
 const PERIOD_NS: i64 = 16_666_667;
 const PERIOD_US: f64 = 16_666.667;
-const PATIENCE: Duration = Duration::from_secs(30);
 
 fn plug(faults: WireFaults) -> TriggerBoxPty {
     TriggerBoxPty::plug(PERIOD_NS, Wire::VirtualCom, faults).unwrap()
@@ -30,7 +32,7 @@ fn edges(vsync: &mut dyn Vsync, count: usize) -> Vec<Edge> {
     let began = Instant::now();
     let mut edges = Vec::new();
     while edges.len() < count {
-        assert!(began.elapsed() < PATIENCE, "{} edges", edges.len());
+        assert!(began.elapsed() < HUNG, "{} edges", edges.len());
         edges.extend(vsync.next_edge(Duration::from_millis(100)).unwrap());
     }
     edges

@@ -1,5 +1,6 @@
 """The page of `raysweep view` in Chromium: view_page.py ADDRESS PLAN ADDRESS_OF_A_RIG_THAT_ASKS [FOLDER FOR SCREENSHOTS]"""
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -8,7 +9,8 @@ from playwright.sync_api import expect, sync_playwright
 address, plan, asking = sys.argv[1], Path(sys.argv[2]).read_text(), sys.argv[3]
 screenshots = Path(sys.argv[4]) if len(sys.argv) > 4 else None
 # A busy machine may take its time.
-expect.set_options(timeout=120_000)
+PATIENCE_MS = 120_000
+expect.set_options(timeout=PATIENCE_MS)
 # Long enough that a slow browser can still pause it.
 LONG = plan.replace("average = 4", "average = 400")
 assert LONG != plan
@@ -188,10 +190,11 @@ def visit(page, name):
 
 
 with sync_playwright() as playwright:
-    browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=["--no-sandbox"])
+    browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
     complaints = []
     for turn, (scheme, width) in enumerate(zip(SCHEMES, WIDTHS)):
         context = browser.new_context(color_scheme=scheme, viewport={"width": width, "height": 900})
+        context.set_default_timeout(PATIENCE_MS)
         page = context.new_page()
         page.on("console", lambda message: complaints.append(message.text) if message.type in ("error", "warning") else None)
         page.on("pageerror", lambda error: complaints.append(str(error)))

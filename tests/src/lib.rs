@@ -17,6 +17,11 @@ use raysweep_session::Session;
 use raysweep_session::ledger::State;
 use raysweep_session::stack::{ArrayName, Contents};
 use tempfile::TempDir;
+use tokio::sync::broadcast::Receiver;
+use tokio::sync::broadcast::error::RecvError;
+
+/// A test that has not come so far after this time hangs; a busy machine takes a minute.
+pub const HUNG: Duration = Duration::from_secs(600);
 
 /// Path of a test data file.
 pub fn data(file: &str) -> PathBuf {
@@ -26,11 +31,11 @@ pub fn data(file: &str) -> PathBuf {
 /// Waits until `holds` returns true.
 ///
 /// # Panics
-/// After a minute.
+/// After [`HUNG`].
 pub fn wait_until(mut holds: impl FnMut() -> bool) {
     let began = Instant::now();
     while !holds() {
-        assert!(began.elapsed() < Duration::from_secs(60), "waited in vain");
+        assert!(began.elapsed() < HUNG, "waited in vain");
         std::thread::sleep(Duration::from_millis(5));
     }
 }
@@ -179,12 +184,23 @@ fn start(folder: &Path, probes: Probes) -> Runner {
 ///
 /// # Panics
 /// When the daemon's core stops first.
-pub fn end_of(events: &mut tokio::sync::broadcast::Receiver<Event>) -> Ended {
-    use tokio::sync::broadcast::error::RecvError;
+pub fn end_of(events: &mut Receiver<Event>) -> Ended {
+    loop {
+        if let Event::Finished { session, state, error, .. } = next_event(events) {
+            return Ended { session, state, error };
+        }
+    }
+}
+
+/// Waits for the next event that is still there: a test that is late misses some.
+///
+/// # Panics
+/// When the daemon's core stops first.
+pub fn next_event(events: &mut Receiver<Event>) -> Event {
     loop {
         match events.blocking_recv() {
-            Ok(Event::Finished { session, state, error, .. }) => return Ended { session, state, error },
-            Ok(_) | Err(RecvError::Lagged(_)) => {}
+            Ok(event) => return event,
+            Err(RecvError::Lagged(_)) => {}
             Err(RecvError::Closed) => panic!("the daemon's core ended before the run"),
         }
     }

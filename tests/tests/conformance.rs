@@ -24,17 +24,14 @@ use raysweep_core::{
 use raysweep_drivers::projector::external::ShowRequest;
 use raysweep_sim::mirror::{MirrorPty, PlayzerXController, PlayzerXControllerConfig, SerialLink, WireFaults};
 use raysweep_sim::triggerbox::TriggerBoxPty;
-use raysweep_tests::rig_text;
-
-/// Generous time limit: only events that never occur may fail a test.
-const PATIENCE: Duration = Duration::from_secs(30);
+use raysweep_tests::{HUNG, rig_text};
 
 /// Edges are numbered and stamped in order, no stamp is in the future, and the median interval is the period.
 fn vsync_conforms(vsync: &mut dyn Vsync, clock: &Clock, period_us: f64) {
     let began = Instant::now();
     let mut edges = Vec::new();
     while edges.len() < 60 {
-        assert!(began.elapsed() < PATIENCE, "{} edges: is there a VSYNC on the line?", edges.len());
+        assert!(began.elapsed() < HUNG, "{} edges: is there a VSYNC on the line?", edges.len());
         let edge = vsync.next_edge(Duration::from_millis(100)).unwrap();
         assert!(edge.is_none_or(|edge| edge.host_ns <= clock.now_ns()), "{edge:?} is of the future");
         edges.extend(edge);
@@ -85,7 +82,7 @@ fn camera_conforms(camera: &mut dyn Camera) {
     let began = Instant::now();
     let mut stamps = Vec::new();
     while stamps.len() < 8 {
-        assert!(began.elapsed() < PATIENCE, "{} frames: is the camera triggered?", stamps.len());
+        assert!(began.elapsed() < HUNG, "{} frames: is the camera triggered?", stamps.len());
         stamps.extend(camera.next_frame(&mut pool.take(), Duration::from_millis(200)).unwrap());
         if stamps.len() == 4 {
             camera.configure(SettingsId { point: 1, attempt: 0 }, &settings).unwrap();

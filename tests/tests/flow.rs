@@ -16,7 +16,7 @@ use raysweep_pipeline::{Stage, StageError, Unit};
 use raysweep_processing as process;
 use raysweep_proto::{ErrorCode, Event, RunParams, RunState};
 use raysweep_session::stack::ArrayName;
-use raysweep_tests::{Bench, PRODUCTS, data, end_of, rig_text, wait_until, with_products};
+use raysweep_tests::{Bench, PRODUCTS, data, end_of, next_event, rig_text, wait_until, with_products};
 
 const PLAN: &str = "kind = \"sweep\"\nname = \"flow\"\n[sweep]\naverage = 3\n\
                     delay_us = { start = -200, stop = 200, count = 5 }\nexposure_us = [100, 250]\n";
@@ -171,7 +171,7 @@ fn light_beyond_the_cameras_range_is_said_in_the_runs_end() {
     let mut events = bench.runner.events();
     bench.runner.run(RunParams { plan: PLAN.into(), ..RunParams::default() }).unwrap();
     loop {
-        if let Event::Finished { warnings, .. } = events.blocking_recv().unwrap() {
+        if let Event::Finished { warnings, .. } = next_event(&mut events) {
             assert!(warnings.iter().any(|warning| warning.contains("saturated")), "{warnings:?}");
             break;
         }
@@ -183,7 +183,9 @@ fn a_cancelled_run_keeps_what_it_has_and_resumes() {
     let paced = small_rig("").replace("[sim]\n", "[sim]\nrealtime = true\n");
     let bench = Bench::new(&paced);
     let mut events = bench.runner.events();
-    bench.runner.run(RunParams { plan: PLAN.into(), ..RunParams::default() }).unwrap();
+    // Seconds of it are left when six points are stored.
+    let plan = PLAN.replace("average = 3", "average = 30");
+    bench.runner.run(RunParams { plan, ..RunParams::default() }).unwrap();
     wait_until(|| bench.runner.status().progress.is_some_and(|progress| progress.points_stored >= 6));
     bench.runner.pause().unwrap();
     assert_eq!(bench.runner.status().state, RunState::Paused);

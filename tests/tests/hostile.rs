@@ -280,7 +280,9 @@ fn during_a_run_plans_are_not_computed_for_clients() {
     let bench = Bench::new(&sim(true));
     let known = bench.runner.check(SWEEP).unwrap();
     let mut events = bench.runner.events();
-    run(&bench.runner).unwrap();
+    // It goes on until it is cancelled.
+    let plan = SWEEP.replace("average = 2", "average = 2000");
+    bench.runner.run(RunParams { plan, ..RunParams::default() }).unwrap();
     let other = SWEEP.replace("average = 2", "average = 3");
     let (busy, kept) = (bench.runner.check(&other), bench.runner.check(SWEEP));
     let design = bench.runner.design(&raysweep_proto::DesignParams {

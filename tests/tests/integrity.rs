@@ -18,7 +18,7 @@ use raysweep_proto::{Event, ResumeParams, RunParams};
 use raysweep_session::integrity::{Audit, Damage};
 use raysweep_session::stack::ArrayName;
 use raysweep_session::{Session, list};
-use raysweep_tests::{Bench, data, dots, rig_text};
+use raysweep_tests::{Bench, data, dots, next_event, rig_text};
 
 /// Saturates in places, so that there are counts of clipped frames.
 const LIGHT: &str = "[sim.ambient]\nlevel = 0.05\n";
@@ -275,7 +275,7 @@ fn damage_is_refused_or_left_out_and_said_and_a_resumed_run_acquires_it_again() 
     let mut events = bench.runner.events();
     bench.runner.resume(ResumeParams { session: folder.clone() }).unwrap();
     let warnings = loop {
-        if let Event::Finished { warnings, state, .. } = events.blocking_recv().unwrap() {
+        if let Event::Finished { warnings, state, .. } = next_event(&mut events) {
             assert_eq!(state, "complete");
             break warnings;
         }
@@ -367,7 +367,7 @@ fn a_session_whose_folder_is_removed_in_mid_run_is_not_made_anew_in_part() {
     let mut events = bench.runner.events();
     bench.runner.run(RunParams { plan: SWEEP.into(), ..RunParams::default() }).unwrap();
     let session = loop {
-        if let Event::Finished { session, state, .. } = events.blocking_recv().unwrap() {
+        if let Event::Finished { session, state, .. } = next_event(&mut events) {
             assert_eq!(state, "faulted");
             break session;
         }

@@ -11,7 +11,7 @@ use ndarray_npy::NpzWriter;
 use raysweep::control::Control;
 use raysweep_proto::{Event, RunParams, RunState};
 use raysweep_session::stack::ArrayName;
-use raysweep_tests::{Bench, dots, rig_text};
+use raysweep_tests::{Bench, dots, next_event, rig_text};
 
 const ROWS: usize = 24;
 const COLUMNS: usize = 16;
@@ -170,7 +170,7 @@ fn a_transport_that_does_not_explain_the_regular_image_is_warned_of_in_capitals(
     let mut events = bench.runner.events();
     bench.runner.run(RunParams { plan: SWEEP.into(), ..RunParams::default() }).unwrap();
     let (session, warnings) = loop {
-        if let Event::Finished { session, warnings, .. } = events.blocking_recv().unwrap() {
+        if let Event::Finished { session, warnings, .. } = next_event(&mut events) {
             break (session, warnings);
         }
     };

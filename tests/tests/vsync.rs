@@ -11,7 +11,7 @@ use raysweep_core::{Counts, LossCause};
 use raysweep_proto::{Event, RunParams};
 use raysweep_sim::mirror::{SerialLink, WireFaults};
 use raysweep_sim::triggerbox::TriggerBoxPty;
-use raysweep_tests::{Bench, Ended, end_of, rig_text};
+use raysweep_tests::{Bench, Ended, end_of, next_event, rig_text};
 
 fn plug(faults: WireFaults) -> TriggerBoxPty {
     TriggerBoxPty::plug(16_666_667, SerialLink::VirtualCom, faults).unwrap()
@@ -55,8 +55,8 @@ fn run_unplugged(reopen_s: f64, meanwhile: impl FnOnce(&Path) -> Option<TriggerB
     let bench = bench(&port, reopen_s);
     let (mut events, mut told) = (bench.runner.events(), bench.runner.events());
     bench.runner.run(RunParams { plan: plan(8, 2), ..RunParams::default() }).unwrap();
-    let stored = |event| matches!(event, Event::Progress(progress) if progress.points_stored == 2);
-    while !stored(events.blocking_recv().unwrap()) {}
+    let stored = |event| matches!(event, Event::Progress(progress) if progress.points_stored >= 2);
+    while !stored(next_event(&mut events)) {}
     pty.unplug();
     std::fs::remove_file(&port).unwrap();
     let _again = meanwhile(&port);

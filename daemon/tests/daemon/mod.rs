@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::Signal;
 use raysweep_proto::{Client, Event, RunParams};
 
-use crate::process::Process;
+use crate::process::{HUNG, Process, wait_for};
 
 /// A daemon on the rig, and with the sessions, of a folder.
 pub struct Daemon {
@@ -42,15 +42,10 @@ impl Daemon {
     }
 
     pub fn client(&mut self) -> Client {
-        let began = Instant::now();
-        loop {
-            if let Ok(client) = Client::connect(&self.socket) {
-                return client;
-            }
+        wait_for("the daemon does not listen", || {
             assert!(!self.process.has_ended(), "the daemon has ended");
-            assert!(began.elapsed() < Duration::from_secs(60), "the daemon does not listen");
-            std::thread::sleep(Duration::from_millis(2));
-        }
+            Client::connect(&self.socket).ok()
+        })
     }
 
     pub fn kill(self) {
@@ -83,7 +78,7 @@ pub fn wait_for_line(session: &Path, line: usize) {
     let began = Instant::now();
     while ledger_lines(session) < line {
         let lines = ledger_lines(session);
-        assert!(began.elapsed() < Duration::from_secs(60), "{lines} lines, not {line}, after a minute");
+        assert!(began.elapsed() < HUNG, "{lines} lines, not {line}");
         std::thread::sleep(Duration::from_micros(200));
     }
 }

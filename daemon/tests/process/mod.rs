@@ -1,5 +1,7 @@
 //! Processes that tests start. None outlives its test, however the test ends.
 
+#![allow(dead_code, reason = "not every test needs all of it")]
+
 use std::os::unix::process::CommandExt;
 use std::process::{Child, ChildStdout, Command, ExitStatus};
 use std::thread;
@@ -8,6 +10,9 @@ use std::time::{Duration, Instant};
 use nix::sys::prctl::set_pdeathsig;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
+
+/// A test that has not come so far after this time hangs; a busy machine takes a minute.
+pub const HUNG: Duration = Duration::from_secs(600);
 
 /// A process that is killed when it is dropped, or when the thread that started it ends in any other way.
 pub struct Process(Child);
@@ -19,10 +24,7 @@ impl Process {
         let command = unsafe { command.pre_exec(|| Ok(set_pdeathsig(Signal::SIGKILL)?)) };
         Self(command.spawn().unwrap_or_else(|error| panic!("{:?}: {error}", command.get_program())))
     }
-}
 
-#[allow(dead_code, reason = "not every test needs all of it")]
-impl Process {
     /// As [`Self::start`], with the standard output that the command pipes.
     pub fn with_output(command: &mut Command) -> (Self, ChildStdout) {
         let mut process = Self::start(command);
@@ -51,14 +53,13 @@ impl Drop for Process {
 }
 
 /// Waits until `look` returns a value.
-#[allow(dead_code, reason = "not every test needs it")]
 pub fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
-    let patience = Instant::now() + Duration::from_secs(60);
+    let began = Instant::now();
     loop {
         if let Some(found) = look() {
             return found;
         }
-        assert!(Instant::now() < patience, "{what}");
+        assert!(began.elapsed() < HUNG, "{what}");
         thread::sleep(Duration::from_millis(10));
     }
 }

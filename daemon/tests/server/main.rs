@@ -5,5 +5,7 @@ mod command;
 mod docs;
 mod fake;
 mod malformed;
+#[path = "../process/mod.rs"]
+mod process;
 mod sessions;
 mod socket;

@@ -13,9 +13,7 @@ use raysweep_proto::{
 use serde_json::{Value, json};
 
 use crate::fake::{Daemon, KEPT_EVENTS, bad_plan, listed, progress, report, session};
-
-/// Time after which an operation counts as hung.
-const HANGS: Duration = Duration::from_secs(60);
+use crate::process::HUNG;
 
 fn code(result: Result<impl std::fmt::Debug, ClientError>) -> ErrorCode {
     match result {
@@ -118,7 +116,7 @@ fn a_slow_subscriber_skips_and_the_others_do_not_wait() {
     }
     let (mut seen, mut skipped) = (0, 0);
     while seen + skipped < total {
-        match slow.next_within(HANGS).unwrap() {
+        match slow.next_within(HUNG).unwrap() {
             Some(Event::Skipped { events }) => skipped += events as usize,
             Some(_) => seen += 1,
             None => panic!("{seen} seen, {skipped} skipped, and no more comes"),
@@ -133,7 +131,7 @@ fn a_client_that_does_not_read_is_dropped() {
     let daemon = Daemon::with(limits, Access::new(None));
     let mut deaf = UnixStream::connect(&daemon.path).unwrap();
     // The server stops reading when its answers find no room, and then closes the connection, so that writing fails.
-    deaf.set_write_timeout(Some(HANGS)).unwrap();
+    deaf.set_write_timeout(Some(HUNG)).unwrap();
     let ask = b"{\"jsonrpc\":\"2.0\",\"id\":1,\"method\":\"describe\"}\n".repeat(100);
     let end = loop {
         if let Err(error) = deaf.write_all(&ask) {
@@ -149,7 +147,7 @@ fn a_client_that_does_not_read_is_dropped() {
 fn come_in(daemon: &Daemon) {
     let since = Instant::now();
     while let Err(error) = daemon.client().status() {
-        assert!(since.elapsed() < HANGS, "no place gets free");
+        assert!(since.elapsed() < HUNG, "no place gets free");
         assert_eq!(code(Err::<(), _>(error)), ErrorCode::TooManyClients);
     }
 }
@@ -169,7 +167,7 @@ fn a_run_that_is_attached_to_its_client_ends_with_it_and_no_other_does() {
         assert_eq!(abandoned(), 0);
         drop(client);
         let since = Instant::now();
-        while abandoned() < expected && since.elapsed() < HANGS {
+        while abandoned() < expected && since.elapsed() < HUNG {
             daemon.client().status().unwrap();
         }
         assert_eq!(abandoned(), expected);

@@ -4,6 +4,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
+#[path = "../process/mod.rs"]
+mod process;
 mod rig;
 
 use std::cell::RefCell;
@@ -11,6 +13,7 @@ use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
+use process::HUNG;
 use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
 use raysweep::control::Control;
@@ -20,9 +23,6 @@ use raysweep_session::integrity::Audit;
 use rig::{Faults, Laboratory, PLANS, RigKind};
 use tokio::sync::broadcast::Receiver;
 use tokio::sync::broadcast::error::TryRecvError;
-
-/// How long any answer may take, on a machine that does something else too.
-const PATIENCE: Duration = Duration::from_secs(30);
 
 /// Sequences in each run of the tests, for each rig.
 const CASES: u32 = 10;
@@ -123,7 +123,7 @@ impl Watch {
         let began = Instant::now();
         let name = format!("{state:?}");
         while !self.seen.contains(&name) && (self.begun == 0 || self.finished < self.begun) {
-            assert!(began.elapsed() < PATIENCE, "no run is {name}, and none is over");
+            assert!(began.elapsed() < HUNG, "no run is {name}, and none is over");
             std::thread::sleep(Duration::from_millis(1));
             self.look();
         }
@@ -133,7 +133,7 @@ impl Watch {
 fn answered<T>(what: &str, request: impl FnOnce() -> T) -> T {
     let began = Instant::now();
     let answer = request();
-    assert!(began.elapsed() < PATIENCE, "{what} was answered after {:?}", began.elapsed());
+    assert!(began.elapsed() < HUNG, "{what} was answered after {:?}", began.elapsed());
     answer
 }
 
@@ -195,7 +195,7 @@ fn conduct(kind: RigKind, steps: &[Step]) -> BTreeSet<String> {
     let _ = answered("cancel", || runner.cancel());
     let began = Instant::now();
     while !matches!(runner.status().state, RunState::Idle | RunState::Faulted) {
-        assert!(began.elapsed() < PATIENCE, "the run does not end: {:?}", runner.status());
+        assert!(began.elapsed() < HUNG, "the run does not end: {:?}", runner.status());
         watch.look();
         std::thread::sleep(Duration::from_millis(2));
     }

@@ -3,6 +3,8 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
 mod conformance;
+#[path = "../suite/hung.rs"]
+mod hung;
 #[path = "../suite/noise.rs"]
 mod noise;
 mod parsers;
@@ -14,3 +16,5 @@ mod stream;
 #[path = "../suite/mirror.rs"]
 mod suite;
 mod ways_out;
+
+use hung::HUNG;

@@ -317,8 +317,7 @@ fn a_state_of_another_boot_is_not_trusted() {
     let other = text.replace(boot_id.trim(), "00000000-0000-0000-0000-000000000000");
     std::fs::write(rig.state(), other).unwrap();
     assert_eq!(park(&rig.state()).unwrap(), Parked::ByReset);
-    std::thread::sleep(Duration::from_millis(50));
-    assert!(rig.pty.look(|truth| truth.parked_since_ns.is_some()));
+    rig.assert_parked();
 }
 
 /// A mirror that has never been moved counts as parked, and parking it needs no controller.

@@ -7,10 +7,14 @@
     reason = "not every test needs all of it, and one that cannot go on may panic"
 )]
 
-use std::process::{Child, Command, Stdio};
-use std::thread;
-use std::time::Duration;
+#[path = "../suite/hung.rs"]
+mod hung;
 
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+use std::{fs, thread};
+
+use hung::HUNG;
 use nix::sched::{CloneFlags, unshare};
 
 /// Moves the calling thread, and all threads and processes that it starts later, to a network of its own with only
@@ -37,8 +41,12 @@ impl FakeCamera {
             .stderr(Stdio::null())
             .spawn()
             .expect("aravis-tools is installed");
-        // It does not report when it is ready.
-        thread::sleep(Duration::from_millis(200));
+        // It does not report when it is ready: when port 3956 is open at its own address and for searches.
+        let began = Instant::now();
+        while fs::read_to_string("/proc/thread-self/net/udp").unwrap().matches(":0F74 ").count() < 2 {
+            assert!(began.elapsed() < HUNG, "the camera does not listen");
+            thread::sleep(Duration::from_millis(5));
+        }
         Self(child)
     }
 }

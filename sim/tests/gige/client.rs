@@ -182,10 +182,15 @@ impl Client {
 
     /// Receives the next complete frame; `None` if the camera falls silent.
     pub fn frame(&mut self) -> Option<Frame> {
+        self.frame_within(PATIENCE)
+    }
+
+    /// The same for a camera that falls silent within `patience`.
+    pub fn frame_within(&mut self, patience: Duration) -> Option<Frame> {
         let mut silent = Instant::now();
         // Number of the last packet by block, where the trailer has arrived.
         let mut last = BTreeMap::new();
-        while silent.elapsed() < Duration::from_millis(1500) {
+        while silent.elapsed() < patience {
             let Some((status, block, kind, packet, data)) = self.packet() else {
                 if self.resend {
                     // The trailers of incomplete frames were lost, so request all their packets.

@@ -8,6 +8,7 @@ mod tools;
 use std::net::Ipv4Addr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU8, Ordering};
 use std::time::Duration;
 
 use raysweep_config::sim::SimConfig;
@@ -28,15 +29,13 @@ const ROW_TIME_US: f64 = 20.0;
 const LATENCY_US: f64 = 8.0;
 const SECOND: Duration = Duration::from_secs(1);
 
-/// A separate camera address per test, so that tests can run in parallel.
-fn address(test: u8) -> Ipv4Addr {
-    Ipv4Addr::new(127, 40, std::process::id() as u8, test)
-}
-
-fn setup(test: u8, faults: Faults) -> GigeSetup {
+/// A camera at an address of its own, so that tests can run in parallel.
+fn setup(faults: Faults) -> GigeSetup {
+    static NEXT: AtomicU8 = AtomicU8::new(1);
+    let camera = NEXT.fetch_add(1, Ordering::Relaxed);
     GigeSetup {
-        address: address(test),
-        serial: format!("T{test}"),
+        address: Ipv4Addr::new(127, 40, std::process::id() as u8, camera),
+        serial: format!("T{camera}"),
         clock: CameraClock::default(),
         faults,
         zipped: false,
@@ -92,14 +91,15 @@ fn expected(settings: CameraSettings) -> Vec<u16> {
 }
 
 /// Starts the rig's camera, triggered by VSYNC, with the projector lit.
-fn lit(test: u8, rig: &PlaneRig, faults: Faults) -> (GigeCamera, Client, Box<dyn Vsync>) {
+fn lit(rig: &PlaneRig, faults: Faults) -> (GigeCamera, Client, Box<dyn Vsync>) {
     let WireDevices { camera, bench: BenchDevices { vsync, mut projector, .. } } = rig.open_for_wire();
-    let camera = GigeCamera::start(&setup(test, faults), camera).unwrap();
+    let setup = setup(faults);
+    let camera = GigeCamera::start(&setup, camera).unwrap();
     let shown = projector.show(&Pattern::White).unwrap();
     while Clock::real().now_ns() < shown.not_before_ns {
         std::thread::sleep(Duration::from_millis(5));
     }
-    let mut client = Client::open(address(test));
+    let mut client = Client::open(setup.address);
     client.set("TriggerMode", 1);
     (camera, client, vsync)
 }
@@ -109,7 +109,7 @@ fn pictures_are_those_of_the_simulation_to_the_bit() {
     let settings = CameraSettings { shutter: Shutter::Rolling, exposure_us: 310.0, trigger_delay_us: 620.5 };
     let counts = expected(settings);
     assert!(counts.iter().max() > counts.iter().min(), "a picture without content would prove nothing");
-    let (_camera, mut client, _vsync) = lit(1, &rig(|_| {}), Faults::default());
+    let (_camera, mut client, _vsync) = lit(&rig(|_| {}), Faults::default());
     client.set_float("ExposureTime", settings.exposure_us);
     client.set_float("TriggerDelay", settings.trigger_delay_us);
     for format in [
@@ -144,7 +144,7 @@ fn a_region_exposes_its_first_row_at_the_trigger() {
         exposure_us: 200.0,
         trigger_delay_us: delay_us,
     });
-    let (_camera, mut client, _vsync) = lit(2, &rig(|_| {}), Faults::default());
+    let (_camera, mut client, _vsync) = lit(&rig(|_| {}), Faults::default());
     client.set_float("ExposureTime", 200.0);
     client.set_float("TriggerDelay", 400.0);
     for (feature, value) in [("Width", 5), ("Height", height), ("OffsetX", 3), ("OffsetY", y)] {
@@ -163,7 +163,7 @@ fn a_region_exposes_its_first_row_at_the_trigger() {
 #[test]
 fn stamps_tell_the_start_of_the_exposure_on_the_cameras_own_clock() {
     let rig = rig(|config| config.vsync.jitter_us = 30.0);
-    let (_camera, mut client, mut vsync) = lit(3, &rig, Faults::default());
+    let (_camera, mut client, mut vsync) = lit(&rig, Faults::default());
     client.set_float("TriggerDelay", 321.0);
     client.set("ChunkModeActive", 1);
     (0..3).for_each(|chunk| client.set_entry("ChunkEnable", chunk, 1));
@@ -192,7 +192,7 @@ fn stamps_tell_the_start_of_the_exposure_on_the_cameras_own_clock() {
 #[test]
 fn settings_can_be_late_and_chunks_later_still() {
     let faults = Faults { late_frames: Some(2), ..Faults::default() };
-    let (camera, mut client, _vsync) = lit(4, &rig(|_| {}), faults);
+    let (camera, mut client, _vsync) = lit(&rig(|_| {}), faults);
     client.set("TriggerSource", 1);
     client.set("ChunkModeActive", 1);
     client.set_entry("ChunkEnable", 0, 1);
@@ -213,7 +213,7 @@ fn settings_can_be_late_and_chunks_later_still() {
 
 #[test]
 fn the_sequencer_takes_a_set_with_every_frame() {
-    let (camera, mut client, _vsync) = lit(8, &rig(|_| {}), Faults::default());
+    let (camera, mut client, _vsync) = lit(&rig(|_| {}), Faults::default());
     client.set("TriggerSource", 1);
     client.set("ChunkModeActive", 1);
     client.set_entry("ChunkEnable", 0, 1);
@@ -259,8 +259,9 @@ fn what_is_lost_doubled_and_overtaken_on_the_way_arrives_in_the_end() {
     let faults =
         Faults { packet_loss: 0.05, duplication: 0.05, reordering: 0.05, seed: 3, ..Faults::default() };
     let size = (120, 160);
-    let camera = GigeCamera::start(&setup(5, faults), Look::at_test_pictures(size)).unwrap();
-    let mut client = Client::open(address(5));
+    let setup = setup(faults);
+    let camera = GigeCamera::start(&setup, Look::at_test_pictures(size)).unwrap();
+    let mut client = Client::open(setup.address);
     client.resend = true;
     client.set("AcquisitionStart", 1);
     for _ in 0..30 {
@@ -283,8 +284,9 @@ fn what_is_lost_doubled_and_overtaken_on_the_way_arrives_in_the_end() {
 #[test]
 fn lost_frames_leave_gaps_and_packets_cannot_be_had_for_ever() {
     let faults = Faults { frame_loss: 0.3, ..Faults::default() };
-    let camera = GigeCamera::start(&setup(6, faults), Look::at_test_pictures((16, 16))).unwrap();
-    let mut client = Client::open(address(6));
+    let setup = setup(faults);
+    let camera = GigeCamera::start(&setup, Look::at_test_pictures((16, 16))).unwrap();
+    let mut client = Client::open(setup.address);
     client.set_float("AcquisitionFrameRate", 200.0);
     client.set("AcquisitionStart", 1);
     let blocks: Vec<u16> = (0..40).map(|_| client.frame().unwrap().block).collect();
@@ -304,17 +306,18 @@ fn lost_frames_leave_gaps_and_packets_cannot_be_had_for_ever() {
 
 #[test]
 fn a_camera_that_died_comes_back_as_nobodys() {
-    let camera = GigeCamera::start(&setup(7, Faults::default()), Look::at_test_pictures((16, 16))).unwrap();
-    let mut client = Client::open(address(7));
+    let setup = setup(Faults::default());
+    let camera = GigeCamera::start(&setup, Look::at_test_pictures((16, 16))).unwrap();
+    let mut client = Client::open(setup.address);
     client.set("Width", 9);
     client.set("AcquisitionStart", 1);
     assert!(client.frame().is_some());
     camera.set_faults(Faults { dead: true, ..Faults::default() });
     // Frames in transit still arrive; then there are no more.
-    while client.frame().is_some() {}
+    while client.frame_within(SECOND).is_some() {}
     assert!(!client.is_answered(Duration::from_millis(500)));
     camera.set_faults(Faults::default());
-    let mut again = Client::open(address(7));
+    let mut again = Client::open(setup.address);
     assert_eq!(again.number("Width"), 16, "the factory's settings");
 }
 
@@ -322,7 +325,8 @@ fn a_camera_that_died_comes_back_as_nobodys() {
 fn vsync_and_projector_reach_another_process() {
     let rig = rig(|_| {});
     let WireDevices { camera, bench } = rig.open_for_wire();
-    let camera = Arc::new(GigeCamera::start(&setup(8, Faults::default()), camera).unwrap());
+    let setup = setup(Faults::default());
+    let camera = Arc::new(GigeCamera::start(&setup, camera).unwrap());
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("bench.sock");
     assert!(RemoteVsync::open(&path).is_err());
@@ -334,7 +338,7 @@ fn vsync_and_projector_reach_another_process() {
     let (first, second) =
         (edges.next_edge(SECOND).unwrap().unwrap(), edges.next_edge(SECOND).unwrap().unwrap());
     assert_eq!((second.seq - first.seq, second.host_ns - first.host_ns), (1, 16_000_000));
-    let mut client = Client::open(address(8));
+    let mut client = Client::open(setup.address);
     client.set("TriggerMode", 1);
     client.set_float("TriggerDelay", 300.0);
     client.set("AcquisitionStart", 1);

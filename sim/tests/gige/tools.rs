@@ -4,7 +4,7 @@ use std::process::Command;
 
 use raysweep_sim::gige::{Faults, GigeCamera, GigeSetup, Look};
 
-use super::{address, rig, setup};
+use super::{rig, setup};
 
 /// Returns a tool's standard output and standard error.
 fn run(tool: &str, arguments: &[&str]) -> String {
@@ -14,8 +14,8 @@ fn run(tool: &str, arguments: &[&str]) -> String {
     String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned()
 }
 
-fn arv_tool(test: u8, arguments: &[&str]) -> String {
-    run("arv-tool-0.8", &[&["-a", &address(test).to_string()], arguments].concat())
+fn arv_tool(camera: &GigeSetup, arguments: &[&str]) -> String {
+    run("arv-tool-0.8", &[&["-a", &camera.address.to_string()], arguments].concat())
 }
 
 /// Reads a number from arv-camera-test's summary.
@@ -27,12 +27,12 @@ fn figure(report: &str, name: &str) -> u64 {
 
 #[test]
 fn arv_tool_reads_and_writes_features() {
-    for (test, zipped) in [(21, false), (22, true)] {
+    for zipped in [false, true] {
         let wire = rig(|_| {}).open_for_wire();
-        let _camera =
-            GigeCamera::start(&GigeSetup { zipped, ..setup(test, Faults::default()) }, wire.camera).unwrap();
+        let setup = GigeSetup { zipped, ..setup(Faults::default()) };
+        let _camera = GigeCamera::start(&setup, wire.camera).unwrap();
         let set = arv_tool(
-            test,
+            &setup,
             &[
                 "control",
                 "ExposureTime=765.25",
@@ -50,7 +50,7 @@ fn arv_tool_reads_and_writes_features() {
         );
         assert!(!set.to_lowercase().contains("error"), "{set}");
         let got = arv_tool(
-            test,
+            &setup,
             &[
                 "control",
                 "ExposureTime",
@@ -82,7 +82,7 @@ fn arv_tool_reads_and_writes_features() {
             assert!(got.contains(line), "{line}: {got}");
         }
         let set = arv_tool(
-            test,
+            &setup,
             &[
                 "control",
                 "SequencerConfigurationMode=On",
@@ -100,16 +100,16 @@ fn arv_tool_reads_and_writes_features() {
             ],
         );
         assert!(!set.to_lowercase().contains("error"), "{set}");
-        let got = arv_tool(test, &["control", "SequencerMode", "SequencerSetNext", "SequencerSetStart"]);
+        let got = arv_tool(&setup, &["control", "SequencerMode", "SequencerSetNext", "SequencerSetStart"]);
         for line in ["SequencerMode = On", "SequencerSetNext = 4", "SequencerSetStart = 3"] {
             assert!(got.contains(line), "{line}: {got}");
         }
-        let refused = arv_tool(test, &["control", "PixelFormat=Mono9", "PixelFormat"]);
+        let refused = arv_tool(&setup, &["control", "PixelFormat=Mono9", "PixelFormat"]);
         assert!(refused.contains("PixelFormat = Mono12p"), "{refused}");
         // Every feature can be read: registers and description agree.
-        let values = arv_tool(test, &["values"]);
+        let values = arv_tool(&setup, &["values"]);
         assert!(!values.to_lowercase().contains("error"), "{values}");
-        let features = arv_tool(test, &["features"]);
+        let features = arv_tool(&setup, &["features"]);
         assert!(!features.contains("not found"), "{features}");
     }
 }
@@ -117,8 +117,9 @@ fn arv_tool_reads_and_writes_features() {
 #[test]
 fn arv_camera_test_streams_without_loss() {
     let wire = rig(|_| {}).open_for_wire();
-    let camera = GigeCamera::start(&setup(23, Faults::default()), wire.camera).unwrap();
-    let name = address(23).to_string();
+    let setup = setup(Faults::default());
+    let camera = GigeCamera::start(&setup, wire.camera).unwrap();
+    let name = setup.address.to_string();
     let features = "TriggerMode=On TriggerSource=Line0 TriggerDelay=500 PixelFormat=Mono12p";
     let report = run(
         "arv-camera-test-0.8",
@@ -142,8 +143,9 @@ fn arv_camera_test_streams_without_loss() {
 #[test]
 fn arv_camera_test_gets_lost_packets_back() {
     let faults = Faults { packet_loss: 0.01, ..Faults::default() };
-    let camera = GigeCamera::start(&setup(24, faults), Look::at_test_pictures((512, 512))).unwrap();
-    let name = address(24).to_string();
+    let setup = setup(faults);
+    let camera = GigeCamera::start(&setup, Look::at_test_pictures((512, 512))).unwrap();
+    let name = setup.address.to_string();
     // Few frames with a long retention time: a busy machine requests packets late.
     let report = run(
         "arv-camera-test-0.8",
@@ -174,13 +176,14 @@ fn arv_tool_discovers_cameras_by_broadcast() {
 #[ignore = "arv_tool_discovers_cameras_by_broadcast runs it in a network namespace"]
 fn in_a_network_of_its_own() {
     run("ip", &["link", "set", "lo", "up"]);
-    let start =
-        |test| GigeCamera::start(&setup(test, Faults::default()), Look::at_test_pictures((8, 8))).unwrap();
-    let _cameras = (start(31), start(32));
+    let setups = [0; 2].map(|_| setup(Faults::default()));
+    let start = |setup| GigeCamera::start(setup, Look::at_test_pictures((8, 8))).unwrap();
+    let _cameras = setups.each_ref().map(start);
     let found = run("arv-tool-0.8", &[]);
-    for test in [31, 32] {
-        assert!(found.contains(&format!("T{test} ({})", address(test))), "{found}");
+    for GigeSetup { serial, address, .. } in &setups {
+        assert!(found.contains(&format!("{serial} ({address})")), "{found}");
     }
-    let opened = run("arv-tool-0.8", &["-n", "raysweep-T32", "control", "DeviceSerialNumber"]);
-    assert!(opened.contains("DeviceSerialNumber = T32"), "{opened}");
+    let serial = &setups[1].serial;
+    let opened = run("arv-tool-0.8", &["-n", &format!("raysweep-{serial}"), "control", "DeviceSerialNumber"]);
+    assert!(opened.contains(&format!("DeviceSerialNumber = {serial}")), "{opened}");
 }
