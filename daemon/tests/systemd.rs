@@ -22,7 +22,8 @@ fn deploy() -> PathBuf {
 
 /// A root with the programs, our units and those that ours refer to and every system has.
 fn staged() -> TempDir {
-    let root = tempfile::tempdir().unwrap();
+    // Programs cannot be executed in every temporary folder.
+    let root = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
     let put = |from: &Path, to: &str| {
         let to = root.path().join(to);
         fs::create_dir_all(to.parent().unwrap()).unwrap();

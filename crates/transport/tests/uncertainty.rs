@@ -11,8 +11,9 @@ use common::{ELECTRONS_PER_COUNT, READ_NOISE_ELECTRONS, WHITE_COUNTS};
 use common::{corner, ideal_stack, paper_sweep, photographed_in, timing};
 use ndarray::{Array1, Array2, Array3, Axis, concatenate, s};
 use raysweep_transport::plane::{
-    Coupling, DarkImage, Demux, NoiseModel, PlaneError, Prior, RowModel, RowTiming, Samples, Setting,
-    Transport, Uncertainty, reach, reference,
+    Coupling, DarkImage, Demux, LightSums, NoiseModel, PixelResponse, PlaneError, Prior, RESPONSE_ROWS,
+    RelitBeam, RowModel, RowTiming, Samples, Setting, SlotKind, Transport, Uncertainty, reach, reference,
+    relight,
 };
 
 /// The noise of one frame of the test camera.
@@ -184,6 +185,11 @@ fn profile(pixel: usize) -> impl Fn(i32) -> f64 {
     }
 }
 
+/// The brightness of a projector row in a relit image.
+fn brightness(v: i32) -> f64 {
+    f64::from(v % 5) / 3.0
+}
+
 #[test]
 fn equals_the_change_of_the_estimate_with_each_sample() {
     let timing = RowTiming::new(32, 22.22, 16_667.0).unwrap().window(16, 1).unwrap();
@@ -216,6 +222,7 @@ fn equals_the_change_of_the_estimate_with_each_sample() {
             let samples = all_samples.select(Axis(0), &used);
             let base = estimate(&samples);
             let mut variances = [0.0; 3];
+            let mut relit_variance = 0.0;
             for (index, &n) in used.iter().enumerate() {
                 let step = 1e-7;
                 let mut changed = samples.clone();
@@ -227,6 +234,9 @@ fn equals_the_change_of_the_estimate_with_each_sample() {
                     let gain: f64 = slots.map(|(_, change)| change).sum();
                     *variance += gain * gain * noise.variance(samples[index], frames[n]);
                 }
+                let slots = model.slots.iter().zip(&change).filter(|(slot, _)| slot.kind == SlotKind::Own);
+                let gain: f64 = slots.map(|(slot, change)| brightness(16 + slot.u) * change).sum();
+                relit_variance += gain * gain * noise.variance(samples[index], frames[n]);
             }
 
             let t = Array3::from_shape_fn((base.len(), 1, 1), |(index, ..)| base[index] as f32);
@@ -257,6 +267,10 @@ fn equals_the_change_of_the_estimate_with_each_sample() {
                     "{prior:?}, {masked:?}, {pixel}: {sd}, {expected}"
                 );
             }
+            let weights = Array1::from_shape_fn(32, |v| brightness(v as i32));
+            let relit = LightSums::Relit { weights: weights.view(), beam: RelitBeam::AsLit };
+            let sd = f64::from(of.of_sums_in_rows(0, &transport, &samples, &relit).unwrap()[[0, 0, 0]]);
+            assert!((sd / relit_variance.sqrt() - 1.0).abs() < 1e-3, "{prior:?}, {masked:?}, {pixel}: {sd}");
         }
     }
 }
@@ -355,4 +369,59 @@ fn direct_light_between_rows_is_judged_where_it_lies() {
 
 fn light_of(transport: &Transport, band: &[RangeInclusive<i32>]) -> f32 {
     light(transport, band)[[0, 0]]
+}
+
+/// Pixels with measured responses at fractions of rows, lit as their responses spread rows, or each by its own alone:
+/// repeated measurements of a relit image spread as predicted, and the image with all rows lit is as certain as all
+/// light.
+#[test]
+fn relit_images_spread_as_predicted() {
+    const REPEATS: u64 = 60;
+    let rows = 62..64;
+    let columns = 16;
+    let place = Array2::from_shape_fn((2, columns), |(t, s)| 62.3 + t as f32 + 0.05 * s as f32);
+    let mut beam = [0.0; RESPONSE_ROWS];
+    (beam[6], beam[7], beam[8]) = (0.2, 0.7, 0.1);
+    let response = PixelResponse::with_beam(place, &beam).unwrap();
+    let timing = timing().window(rows.start, rows.len()).unwrap().with_response(response).unwrap();
+    let scene = ideal_stack(&corner(), &paper_sweep());
+    let ideal = scene.slice(s![.., rows, ..8 * columns; 8]).to_owned();
+    let demux = Demux::new(timing.clone(), paper_sweep(), Prior::SPLIT).unwrap();
+    let frames = [8; 75];
+    let of = Uncertainty {
+        timing: &timing,
+        settings: &paper_sweep(),
+        prior: Prior::SPLIT,
+        noise: camera_noise(),
+        frames: &frames,
+        darks: &[],
+        calibration: None,
+    };
+    let stripes = Array1::from_shape_fn(timing.projector_rows(), |v| f64::from(u8::from(v % 7 < 3)));
+    let all = Array1::ones(timing.projector_rows());
+    for beam in [RelitBeam::AsLit, RelitBeam::Ideal] {
+        let measure = |seed| {
+            let stack = photographed_in(8, &ideal, seed);
+            let estimate = demux.solve(stack.view(), None).unwrap();
+            let samples = Samples { stack: stack.view(), valid: None, variance_ratio: None, u0_rows: None };
+            let sd = |weights: &Array1<f64>| {
+                let relit = LightSums::Relit { weights: weights.view(), beam };
+                of.of_sums_in_rows(0, &estimate, &samples, &relit).unwrap().index_axis_move(Axis(0), 0)
+            };
+            if beam == RelitBeam::Ideal {
+                let total = of.of_bands(&estimate, &samples, &[vec![i32::MIN..=i32::MAX]]).unwrap();
+                assert_eq!(sd(&all), total.index_axis(Axis(0), 0));
+            }
+            (relight(&timing, &estimate, stripes.view(), beam).unwrap(), sd(&stripes))
+        };
+        let measured: Vec<_> = (0..REPEATS).map(measure).collect();
+        let mean = measured.iter().fold(Array2::<f32>::zeros((2, columns)), |sum, (light, _)| sum + light)
+            / REPEATS as f32;
+        let within = measured.iter().flat_map(|(light, sd)| {
+            (light - &mean).into_iter().zip(sd.clone()).map(|(deviation, sd)| deviation.abs() < sd)
+        });
+        let share = within.filter(|&within| within).count() as f64 / (REPEATS as usize * mean.len()) as f64;
+        println!("{beam:?}: {share:.3} within one standard deviation");
+        assert!((0.63..0.73).contains(&share), "{beam:?}: {share}");
+    }
 }

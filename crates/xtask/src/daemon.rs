@@ -26,6 +26,8 @@ impl Daemon {
         static STARTED: AtomicU32 = AtomicU32::new(0);
         let number = STARTED.fetch_add(1, Ordering::Relaxed);
         let runtime = std::env::temp_dir().join(format!("raysweep-xtask-{}-{number}", std::process::id()));
+        // Another process of this number may have left it.
+        let _ = std::fs::remove_dir_all(&runtime);
         std::fs::create_dir_all(&runtime).map_err(|error| format!("{}: {error}", runtime.display()))?;
         let process = Command::new(programs.join("raysweepd"))
             // As its unit does.

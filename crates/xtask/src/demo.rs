@@ -42,6 +42,8 @@ pub fn demo() -> Done {
 /// The newest session; session names begin with the time.
 fn newest(data: &Path) -> Done<PathBuf> {
     let folders = std::fs::read_dir(data).map_err(|error| format!("{}: {error}", data.display()))?;
-    let newest = folders.flatten().map(|folder| folder.path()).max();
-    newest.ok_or_else(|| format!("{}: no session", data.display()))
+    let reported =
+        folders.flatten().map(|folder| folder.path()).filter(|path| path.join("report.html").exists());
+    let newest = reported.max();
+    newest.ok_or_else(|| format!("{}: no session with a report", data.display()))
 }

@@ -36,6 +36,10 @@ usage: cargo xtask <command>
   bench [NAME]       measures; without a name, tells which benchmarks there are";
 
 fn main() -> ExitCode {
+    if let Some(error) = run::find_system_programs() {
+        eprintln!("{error}");
+        return ExitCode::FAILURE;
+    }
     let arguments: Vec<String> =
         std::env::args_os().skip(1).map(|word| word.to_string_lossy().into_owned()).collect();
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();

@@ -2,7 +2,7 @@
 
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::process::CommandExt;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, Command, Stdio};
 
 /// Kills remaining processes and removes the folder `$1`, once told that the script has ended, or when we have died:
@@ -22,7 +22,10 @@ const PRELUDE: &str = include_str!("rootfs.sh");
 
 /// Why this machine does not allow it, and what to do, or `None`.
 pub fn forbidden() -> Option<String> {
-    let tried = Command::new("unshare").args(namespaces()).args(["chroot", "/", "true"]).output();
+    // Where a single user is mapped, files cannot be given to another group.
+    let trial =
+        "chroot / true && file=$(mktemp) && { chown 0:50 \"$file\"; code=$?; rm \"$file\"; exit $code; }";
+    let tried = Command::new("unshare").args(namespaces()).args(["sh", "-c", trial]).output();
     let said = match tried {
         Ok(output) if output.status.success() => return None,
         Ok(output) => String::from_utf8_lossy(&output.stderr).trim().to_owned(),
@@ -86,6 +89,11 @@ fn lacking_as_user() -> Vec<String> {
     lacking
 }
 
+/// The folder of this process: another's may still be being removed.
+pub fn folder_of(name: &Path) -> PathBuf {
+    name.with_extension(std::process::id().to_string())
+}
+
 /// A script running as root in its own mount and process namespaces.
 pub struct Running {
     process: Child,
@@ -93,8 +101,10 @@ pub struct Running {
 }
 
 impl Running {
-    /// Starts a shell script with the folder as `$1`, followed by the arguments. Its output goes to a pipe.
-    pub fn start(script: &str, folder: &Path, arguments: &[&str]) -> Result<Self, String> {
+    /// Starts a shell script with a folder of its own, [`folder_of`] `name`, as `$1`, followed by the arguments. Its
+    /// output goes to a pipe.
+    pub fn start(script: &str, name: &Path, arguments: &[&str]) -> Result<Self, String> {
+        let folder = &folder_of(name);
         let mut guard = Guard::start(folder)?;
         let script = format!("{PRELUDE}\n{script}");
         // A separate process group: if we are interrupted, the guard cleans up.

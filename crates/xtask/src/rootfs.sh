@@ -1,9 +1,12 @@
-# Output is one stream, and what a guard that was killed has left goes first.
+# Output is one stream. What guards that were killed have left goes first: roots are named after their processes.
 exec 2>&1
+for left in "${1%.*}".*; do
+    [ -e "/proc/${left##*.}" ] || rm --recursive --force --one-file-system "$left"
+done
 rm --recursive --force --one-file-system "$1"
 
-# Mounts in the root $1 what containers have: itself, without which programs in it could have no mounts of their own, processes,
-# the machine's devices to read, and those devices that hold nothing.
+# Mounts in the root $1 what containers have: itself, without which programs in it could have no mounts of their own,
+# processes, the machine's devices to read, and those devices that hold nothing.
 mount_system() {
     mount --bind "$1" "$1"
     mount -t proc proc "$1/proc"

@@ -1,8 +1,9 @@
 //! Running other programs.
 
-use std::ffi::OsStr;
+use std::ffi::{OsStr, OsString};
 use std::io::{ErrorKind, Write};
 use std::os::unix::fs::PermissionsExt;
+use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -32,11 +33,32 @@ fn named_target() -> Option<PathBuf> {
 pub fn cargo() -> Command {
     let mut command = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
     command.current_dir(root());
-    // Cargo runs in a different folder, where a relative path would point elsewhere.
-    if let Some(target) = named_target() {
-        command.env("CARGO_TARGET_DIR", target);
-    }
+    // What it builds is looked for there, whatever other variables and configuration files say.
+    command.env("CARGO_TARGET_DIR", target()).env_remove("CARGO_BUILD_TARGET");
     command
+}
+
+/// Where Debian has chroot and mke2fs; not on the path of its ordinary users.
+const SYSTEM_FOLDERS: [&str; 3] = ["/usr/local/sbin", "/usr/sbin", "/sbin"];
+
+/// Starts this program anew with the folders of the system's programs on the path, unless they are there; returns why
+/// that failed.
+pub fn find_system_programs() -> Option<String> {
+    let path = with_system_folders(&std::env::var_os("PATH")?)?;
+    let mut again = Command::new(std::env::current_exe().ok()?);
+    let error = again.args(std::env::args_os().skip(1)).env("PATH", path).exec();
+    Some(format!("cannot start xtask again: {error}"))
+}
+
+/// A path with the folders that it lacks at its end; `None` if it lacks none.
+fn with_system_folders(path: &OsStr) -> Option<OsString> {
+    let named: Vec<PathBuf> = std::env::split_paths(path).collect();
+    let lacking = SYSTEM_FOLDERS.map(PathBuf::from).into_iter().filter(|folder| !named.contains(folder));
+    let lacking: Vec<PathBuf> = lacking.collect();
+    match lacking.is_empty() {
+        true => None,
+        false => std::env::join_paths(named.into_iter().chain(lacking)).ok(),
+    }
 }
 
 /// The program that a shell would start for a name.
@@ -75,6 +97,13 @@ fn shown(command: &Command) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn folders_of_system_programs_are_added_once() {
+        let path = with_system_folders(OsStr::new("/usr/bin:/sbin")).unwrap();
+        assert_eq!(path, "/usr/bin:/sbin:/usr/local/sbin:/usr/sbin");
+        assert_eq!(with_system_folders(&path), None);
+    }
 
     #[test]
     fn a_program_is_a_file_that_may_be_executed() {

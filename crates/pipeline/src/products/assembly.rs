@@ -6,7 +6,6 @@ use raysweep_transport::plane::Transport;
 use super::mask;
 use super::profile::ProfileSums;
 use super::spec::{ProductKind, ProductSpec};
-use super::uncertainty;
 use crate::product::Product;
 use crate::stack::SweepStack;
 
@@ -85,13 +84,11 @@ impl Assembly {
             ProductKind::Relight(pattern) => pattern
                 .make(name, &stack.timing, first_row, transport, mask)
                 .map_err(|error| not_made(error.to_string()))?,
-            ProductKind::Uncertainty(band) => {
-                uncertainty::make(name, band.of_stack(stack), first_row, stack, transport, mask)
-                    .map_err(not_made)?
+            ProductKind::Uncertainty(of) => {
+                of.make(name, first_row, stack, transport, mask).map_err(not_made)?
             }
-            ProductKind::PriorBias(band) => {
-                uncertainty::make_bias(name, band.of_stack(stack), first_row, stack, transport, mask)
-                    .map_err(not_made)?
+            ProductKind::PriorBias(of) => {
+                of.make_bias(name, first_row, stack, transport, mask).map_err(not_made)?
             }
             ProductKind::DelayProfile(options) => {
                 options.add(&mut self.sums, first_row, stack, transport);

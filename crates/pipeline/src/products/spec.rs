@@ -9,6 +9,7 @@ use serde_json::{Map, Value};
 use super::band::{Band, Width};
 use super::profile::{ProfileOptions, ProfileTable};
 use super::relight::{BeamName, Relight, RowPattern};
+use super::uncertainty::LightOf;
 use crate::schedule::{Schedule, SweepGeometry};
 use raysweep_core::decoding_message_beside;
 
@@ -40,8 +41,8 @@ pub(super) enum ProductKind {
     Band(Band),
     Relight(Relight),
     DelayProfile(ProfileOptions),
-    Uncertainty(Band),
-    PriorBias(Band),
+    Uncertainty(LightOf),
+    PriorBias(LightOf),
 }
 
 impl ProductKind {
@@ -54,7 +55,8 @@ impl ProductKind {
                 let own = width.range();
                 vec![i32::MIN..=*own.start() - 1, *own.end() + 1..=i32::MAX]
             }
-            Self::Band(band) | Self::Uncertainty(band) | Self::PriorBias(band) => band.open_ranges(),
+            Self::Band(band) => band.open_ranges(),
+            Self::Uncertainty(of) | Self::PriorBias(of) => of.rows(),
             Self::Relight(_) => vec![i32::MIN..=i32::MAX],
         }
     }
@@ -103,20 +105,9 @@ impl ProductSpec {
             "epipolar" => ProductKind::Epipolar(parse::<Width>(kind, options)?.check().map_err(one)?),
             "non-epipolar" => ProductKind::NonEpipolar(parse::<Width>(kind, options)?.check().map_err(one)?),
             "band" => ProductKind::Band(parse::<Band>(kind, options)?.check().map_err(one)?),
-            "uncertainty" => ProductKind::Uncertainty(parse::<Band>(kind, options)?.check().map_err(one)?),
-            "prior-bias" => ProductKind::PriorBias(parse::<Band>(kind, options)?.check().map_err(one)?),
-            "relight" => {
-                let (beam, pattern): (Map<_, _>, Map<_, _>) =
-                    options.clone().into_iter().partition(|(key, _)| key == "beam");
-                if pattern.len() != 1 {
-                    let what = "give exactly one of rows, stripes and line".to_owned();
-                    return Err(refused(Vec::new(), what));
-                }
-                let BeamOption { beam } = parse(kind, &beam)?;
-                let relight = Relight::new(parse::<RowPattern>(kind, &pattern)?, beam);
-                relight.check(geometry).map_err(|(path, what)| refused(path, what))?;
-                ProductKind::Relight(relight)
-            }
+            "uncertainty" => ProductKind::Uncertainty(light_of(kind, options, geometry)?),
+            "prior-bias" => ProductKind::PriorBias(light_of(kind, options, geometry)?),
+            "relight" => ProductKind::Relight(relight(kind, options, geometry)?),
             "delay-profile" => {
                 let table: ProfileTable = parse(kind, options)?;
                 ProductKind::DelayProfile(table.check(schedule, geometry).map_err(one)?)
@@ -141,7 +132,7 @@ impl ProductSpec {
             spec("non_epipolar", ProductKind::NonEpipolar(Width::default())),
             spec("short_range", ProductKind::Band(Band::new(1, Some(10)))),
             spec("long_range", ProductKind::Band(Band::new(11, None))),
-            spec("uncertainty", ProductKind::Uncertainty(Band::new(0, Some(0)))),
+            spec("uncertainty", ProductKind::Uncertainty(LightOf::Band(Band::new(0, Some(0))))),
         ]
     }
 
@@ -154,9 +145,8 @@ impl ProductSpec {
     pub fn beyond(&self, (first, last): (i32, i32)) -> Option<String> {
         let what = match &self.kind {
             ProductKind::Epipolar(width) | ProductKind::NonEpipolar(width) => width.beyond(first, last),
-            ProductKind::Band(band) | ProductKind::Uncertainty(band) | ProductKind::PriorBias(band) => {
-                band.beyond(first, last)
-            }
+            ProductKind::Band(band) => band.beyond(first, last),
+            ProductKind::Uncertainty(of) | ProductKind::PriorBias(of) => of.beyond(first, last),
             ProductKind::Regular | ProductKind::Relight(_) | ProductKind::DelayProfile(_) => None,
         }?;
         Some(format!("product {}: {what}", self.name))
@@ -186,10 +176,50 @@ impl ProductKind {
             Self::Band(band) => band.default_name(),
             Self::Relight(_) => "relight".into(),
             Self::DelayProfile(options) => options.default_name(),
-            Self::Uncertainty(band) => format!("uncertainty_{}", band.default_name()),
-            Self::PriorBias(band) => format!("prior_bias_{}", band.default_name()),
+            Self::Uncertainty(of) => format!("uncertainty_{}", of.default_name()),
+            Self::PriorBias(of) => format!("prior_bias_{}", of.default_name()),
         }
     }
+}
+
+fn relight(
+    kind: &str,
+    options: &Map<String, Value>,
+    geometry: &SweepGeometry,
+) -> Result<Relight, ProductError> {
+    let refused = |(path, what)| ProductError { kind: kind.into(), path, what };
+    let (beam, pattern): (Map<_, _>, Map<_, _>) =
+        options.clone().into_iter().partition(|(key, _)| key == "beam");
+    if pattern.len() != 1 {
+        return Err(refused((Vec::new(), "give exactly one of rows, stripes and line".to_owned())));
+    }
+    let BeamOption { beam } = parse(kind, &beam)?;
+    let relight = Relight::new(parse::<RowPattern>(kind, &pattern)?, beam);
+    relight.check(geometry).map_err(refused)?;
+    Ok(relight)
+}
+
+/// The options of `uncertainty` and `prior-bias`: those of `band`, or of `relight`.
+fn light_of(
+    kind: &str,
+    options: &Map<String, Value>,
+    geometry: &SweepGeometry,
+) -> Result<LightOf, ProductError> {
+    let refused = |path: Vec<String>, what: String| ProductError { kind: kind.into(), path, what };
+    if options.contains_key("line") {
+        let what = "line: is a sequence of images; give rows or stripes, or from_rows".to_owned();
+        return Err(refused(vec!["line".into()], what));
+    }
+    let has = |keys: &[&str]| keys.iter().filter(|key| options.contains_key(**key)).count();
+    if has(&["rows", "stripes", "beam"]) > 0 {
+        if has(&["rows", "stripes"]) != 1 || has(&["from_rows", "to_rows", "side"]) > 0 {
+            let what = "give either from_rows, perhaps with to_rows and side, or one of rows and stripes";
+            return Err(refused(Vec::new(), what.to_owned()));
+        }
+        return relight(kind, options, geometry).map(LightOf::Relit);
+    }
+    let band = parse::<Band>(kind, options)?.check();
+    band.map(LightOf::Band).map_err(|(field, what)| refused(vec![field.into()], what))
 }
 
 fn parse<T: DeserializeOwned>(kind: &str, options: &Map<String, Value>) -> Result<T, ProductError> {

@@ -247,6 +247,8 @@ fn products_of_strips_have_the_bits_of_the_whole() {
         json!({ "kind": "delay-profile", "region": [1, 6, 0, 3] }),
         json!({ "kind": "uncertainty", "from_rows": 1, "to_rows": 3 }),
         json!({ "kind": "prior-bias", "from_rows": 1, "to_rows": 3 }),
+        json!({ "kind": "uncertainty", "stripes": { "period_rows": 3, "lit_rows": 2 } }),
+        json!({ "kind": "prior-bias", "rows": [{ "first": 1, "last": 3 }], "beam": "ideal" }),
     ] {
         let spec = spec(&table).unwrap();
         let whole = spec.make(&stack, &transport()).unwrap();
@@ -304,6 +306,10 @@ fn bad_tables_are_refused_by_field_and_value() {
         ),
         (json!({ "kind": "relight", "line": { "height_rows": 1, "step_rows": 0 } }), "line.step_rows"),
         (json!({ "kind": "relight", "line": { "height_rows": 11, "step_rows": 1 } }), "line.height_rows"),
+        (json!({ "kind": "uncertainty" }), ""),
+        (json!({ "kind": "uncertainty", "rows": [{ "first": 10, "last": 12 }] }), "rows.0.first"),
+        (json!({ "kind": "uncertainty", "line": { "height_rows": 1, "step_rows": 1 } }), "line"),
+        (json!({ "kind": "prior-bias", "from_rows": 1, "stripes": {} }), ""),
         (json!({ "kind": "delay-profile" }), "pixel"),
         (json!({ "kind": "delay-profile", "pixel": [6, 0] }), "pixel"),
         (json!({ "kind": "delay-profile", "pixel": [0] }), "pixel"),

@@ -1,51 +1,108 @@
-//! How far to trust a band's light: `uncertainty`, the standard deviation, and `prior-bias`, what the prior may add.
+//! How far to trust the light of a band or of a relit image: `uncertainty`, the standard deviation, and `prior-bias`,
+//! what the prior may add.
+
+use std::ops::RangeInclusive;
 
 use ndarray::{Array2, Array3, Axis};
-use raysweep_transport::plane::{NoiseModel, PlaneError, Samples, Transport, Uncertainty};
+use raysweep_transport::plane::{LightSums, NoiseModel, PlaneError, Samples, Transport, Uncertainty};
 
 use super::band::Band;
+use super::relight::Relight;
 use crate::product::Product;
 use crate::stack::SweepStack;
 
-/// The standard deviation for the camera rows starting at `first_row`, to which stack and transport belong.
-pub(super) fn make(
-    name: String,
-    band: Band,
-    first_row: usize,
-    stack: &SweepStack,
-    transport: &Transport,
-    mask: Array2<u8>,
-) -> Result<Product, String> {
-    let noise = stack.noise.ok_or("the stack's noise could not be fitted; the report says why")?;
-    let image = image(stack, noise, |model, samples| {
-        model.of_bands_in_rows(first_row, transport, samples, &[band.ranges()])
-    })?;
-    let of = match stack.calibration {
-        Some(_) => "noise, dark images and calibration",
-        None => "noise and dark images",
-    };
-    let about = format!(
-        "standard deviation, through {of}, of {}; the prior's bias is not in it: see prior-bias",
-        band.says()
-    );
-    Ok(Product::Image { name, about, image, mask })
+/// The light whose trust is told: that of a band, or of an image under some rows.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum LightOf {
+    Band(Band),
+    Relit(Relight),
 }
 
-/// The size of the prior's bias for the same rows.
-pub(super) fn make_bias(
-    name: String,
-    band: Band,
-    first_row: usize,
-    stack: &SweepStack,
-    transport: &Transport,
-    mask: Array2<u8>,
-) -> Result<Product, String> {
-    let none = NoiseModel { read_variance: 0.0, gain: 0.0 };
-    let image = image(stack, none, |model, samples| {
-        model.prior_bias_in_rows(first_row, transport, samples, &[band.ranges()])
-    })?;
-    let about = format!("size of the bias that the prior may give to {}", band.says());
-    Ok(Product::Image { name, about, image, mask })
+impl LightOf {
+    pub(super) fn default_name(&self) -> String {
+        match self {
+            Self::Band(band) => band.default_name(),
+            Self::Relit(_) => "relight".into(),
+        }
+    }
+
+    /// The relative rows whose light it tells apart.
+    pub(super) fn rows(&self) -> Vec<RangeInclusive<i32>> {
+        match self {
+            Self::Band(band) => band.open_ranges(),
+            Self::Relit(_) => vec![i32::MIN..=i32::MAX],
+        }
+    }
+
+    /// Why a sweep of this reach sees none of it.
+    pub(super) fn beyond(&self, first: i32, last: i32) -> Option<String> {
+        match self {
+            Self::Band(band) => band.beyond(first, last),
+            Self::Relit(_) => None,
+        }
+    }
+
+    /// The standard deviation for the camera rows starting at `first_row`, to which stack and transport belong.
+    pub(super) fn make(
+        &self,
+        name: String,
+        first_row: usize,
+        stack: &SweepStack,
+        transport: &Transport,
+        mask: Array2<u8>,
+    ) -> Result<Product, String> {
+        let noise = stack.noise.ok_or("the stack's noise could not be fitted; the report says why")?;
+        let (says, image) = self.image(stack, noise, |model, samples, sums| {
+            model.of_sums_in_rows(first_row, transport, samples, sums)
+        })?;
+        let of = match stack.calibration {
+            Some(_) => "noise, dark images and calibration",
+            None => "noise and dark images",
+        };
+        let about = format!(
+            "standard deviation, through {of}, of {says}; the prior's bias is not in it: see prior-bias"
+        );
+        Ok(Product::Image { name, about, image, mask })
+    }
+
+    /// The size of the prior's bias for the same rows.
+    pub(super) fn make_bias(
+        &self,
+        name: String,
+        first_row: usize,
+        stack: &SweepStack,
+        transport: &Transport,
+        mask: Array2<u8>,
+    ) -> Result<Product, String> {
+        let none = NoiseModel { read_variance: 0.0, gain: 0.0 };
+        let (says, image) = self.image(stack, none, |model, samples, sums| {
+            model.prior_bias_in_rows(first_row, transport, samples, sums)
+        })?;
+        let about = format!("size of the bias that the prior may give to {says}");
+        Ok(Product::Image { name, about, image, mask })
+    }
+
+    /// What the light is, and the image that `make` computes of it.
+    fn image(
+        &self,
+        stack: &SweepStack,
+        noise: NoiseModel,
+        make: impl FnOnce(&Uncertainty<'_>, &Samples<'_>, &LightSums<'_>) -> Result<Array3<f32>, PlaneError>,
+    ) -> Result<(String, Array2<f32>), String> {
+        let make = |sums: &LightSums<'_>| image(stack, noise, |model, samples| make(model, samples, sums));
+        match self {
+            Self::Band(band) => {
+                let band = band.of_stack(stack);
+                Ok((band.says(), make(&LightSums::Bands(&[band.ranges()]))?))
+            }
+            Self::Relit(relight) => {
+                let (says, weights) =
+                    relight.weights(stack.timing.projector_rows()).ok_or("a sequence has no uncertainty")?;
+                let says = format!("the scene {says}");
+                Ok((says, make(&LightSums::Relit { weights: weights.view(), beam: relight.beam() })?))
+            }
+        }
+    }
 }
 
 /// The image that `make` computes from a stack.

@@ -38,7 +38,9 @@ pub use model::{
     Setting, Shares, Slot, SlotKind, Transport, delay_us, offset_us, predict, reach, relative_rows,
 };
 pub use noise::{Coupled, Coupling, NoiseModel};
-pub use products::{DarkImage, DelayProfile, RelitBeam, Samples, Uncertainty, relight, relight_rows};
+pub use products::{
+    DarkImage, DelayProfile, LightSums, RelitBeam, Samples, Uncertainty, relight, relight_rows,
+};
 #[doc(hidden)]
 pub use solve::linear;
 pub use solve::{Bracket, Demux, Prior, SimdLevel, objectives_bytes, reference};

@@ -2,7 +2,7 @@
 
 use std::process::{Command, Stdio};
 
-use crate::run::{Done, run};
+use crate::run::{Done, say};
 
 /// Installs only the named packages and their dependencies.
 const INSTALL: [&str; 3] = ["install", "--yes", "--no-install-recommends"];
@@ -55,12 +55,37 @@ fn apt_get(arguments: &[&str]) -> Done {
     let mut apt = Command::new("apt-get");
     // A machine that has just started updates itself, and downloads can fail once.
     apt.args(["-o", "DPkg::Lock::Timeout=600", "-o", "Acquire::Retries=3"]);
-    run(apt.args(arguments).env("DEBIAN_FRONTEND", "noninteractive").stdout(Stdio::null()))
+    // A question would not be seen.
+    apt.args(["-o", "Dpkg::Options::=--force-confold"]).env("DEBIAN_FRONTEND", "noninteractive");
+    apt.args(arguments).stdin(Stdio::null()).env("LC_ALL", "C");
+    eprintln!("$ apt-get {}", arguments.join(" "));
+    let output = apt.output().map_err(|error| format!("cannot start apt-get: {error}"))?;
+    let said = String::from_utf8_lossy(&output.stdout);
+    if !output.status.success() {
+        eprint!("{said}{}", String::from_utf8_lossy(&output.stderr));
+        return Err(format!("`apt-get {}` ended with {}", arguments.join(" "), output.status));
+    }
+    removed(&said).map_or(Ok(()), |names| say(&format!("apt removed {names}, which cannot be beside them")))
+}
+
+/// The packages that apt says it removes.
+fn removed(said: &str) -> Option<String> {
+    let (_, after) = said.split_once("The following packages will be REMOVED:\n")?;
+    let names = after.lines().take_while(|line| line.starts_with(' '));
+    Some(names.map(str::trim).collect::<Vec<_>>().join(" "))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_apt_removes_is_told() {
+        let said =
+            "Reading\nThe following packages will be REMOVED:\n  a b\n  c\nThe following NEW packages\n  d\n";
+        assert_eq!(removed(said).unwrap(), "a b c");
+        assert_eq!(removed("The following NEW packages\n  d\n"), None);
+    }
 
     #[test]
     fn a_candidate_is_a_version() {

@@ -55,10 +55,15 @@ pub fn install() -> Done {
     }
     eprintln!("{listed}");
     // If one of several sources is unreachable, another may still have what is missing.
-    if let Err(error) = apt::update() {
+    let updated = apt::update();
+    let known = candidates(&missing);
+    if let Err(error) = updated {
+        if known.is_empty() {
+            return Err(format!("{error}, and apt knows none of what is missing: mend that first"));
+        }
         eprintln!("{error}; going on with the lists that there are");
     }
-    apt::install(&chosen(&missing, &candidates(&missing))?)?;
+    apt::install(&chosen(&missing, &known)?)?;
     still_missing(&sorted(missing.into_iter().map(|it| it.entry)).1)
 }
 
@@ -103,7 +108,11 @@ fn advice(missing: &[Missing], known: &[String]) -> String {
 /// The command to run. Apt's lists may never have been fetched, which only root can do, so packages missing from them
 /// are not an error yet.
 fn by_hand(missing: &[Missing], known: &[String], is_root: bool) -> String {
-    let (names, unknown) = choices(missing, known);
+    let (mut names, unknown) = choices(missing, known);
+    if unknown.len() < missing.len() {
+        // Apt would refuse all for one that it does not know.
+        names.retain(|name| known.contains(name));
+    }
     let mut said = format!("install with\n  {}", apt::by_hand(&names, is_root));
     if !unknown.is_empty() {
         said += &format!(

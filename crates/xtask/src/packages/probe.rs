@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 
 use super::{elf, libclang};
-use crate::run::{Done, program};
+use crate::run::{Done, program, target};
 
 /// A requirement that a package fulfils.
 #[derive(Debug, PartialEq)]
@@ -237,7 +237,13 @@ fn compiles(language: Language) -> Done {
             (Tool::compiler("c++", "CXX"), "c++", "#include <vector>\nint main() { return 0; }\n")
         }
     };
-    compiler.run(&["-x", kind, "-o", "/dev/null", "-"], source)
+    // Not /dev/null, which tcc replaces by a file.
+    let folder = target().join("tmp");
+    std::fs::create_dir_all(&folder).map_err(|error| format!("{}: {error}", folder.display()))?;
+    let made = folder.join(format!("probe-{}", std::process::id()));
+    let done = compiler.run(&["-x", kind, "-o", &made.display().to_string(), "-"], source);
+    let _ = std::fs::remove_file(made);
+    done
 }
 
 #[cfg(test)]

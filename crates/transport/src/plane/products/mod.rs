@@ -7,4 +7,4 @@ mod uncertainty;
 
 pub use profile::DelayProfile;
 pub use relight::{RelitBeam, relight, relight_rows};
-pub use uncertainty::{DarkImage, Samples, Uncertainty};
+pub use uncertainty::{DarkImage, LightSums, Samples, Uncertainty};

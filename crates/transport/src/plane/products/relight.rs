@@ -47,45 +47,98 @@ pub fn relight_rows(
     weights: ArrayView1<f64>,
     beam: RelitBeam,
 ) -> Result<Array2<f32>, PlaneError> {
-    check_shape("weights", "[projector rows]", &[weights.len()], &[timing.projector_rows()])?;
     let (_, rows, columns) = transport.t.dim();
-    timing.check_columns(columns)?;
     let (end, camera_rows) = (first_row + rows, timing.camera_rows());
     if end > camera_rows {
         return Err(PlaneError::Rows { row: end - 1, camera_rows });
     }
-
-    let spread = match beam {
-        RelitBeam::AsLit if timing.response().is_none() => {
-            Array1::from(timing.beam().spread(weights.to_vec()))
-        }
-        RelitBeam::AsLit | RelitBeam::Ideal => weights.to_owned(),
-    };
+    let lit = LitRows::new(timing, columns, weights, beam)?;
     let mut image = Array2::zeros((rows, columns));
     image.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(at, mut image_row)| {
         let profiles = transport.t.index_axis(Axis(1), at);
-        let Some(response) = timing.response() else {
-            let own_row = timing.camera().own_row(first_row + at) as i64;
-            relight_row(image_row, profiles, own_row + i64::from(transport.u_min), spread.view());
-            return;
-        };
-        for class in response.classes(first_row + at, 0..columns, PLACE_STEPS) {
-            let weights = match beam {
-                RelitBeam::AsLit => collected_rows(spread.view(), &class.shares, 0, spread.len()),
-                RelitBeam::Ideal => spread.clone(),
-            };
+        for class in lit.classes(first_row + at) {
             let mut relit = Array1::zeros(class.columns.len());
             let first_v = class.own_row + i64::from(transport.u_min);
             relight_row(
                 relit.view_mut(),
                 profiles.select(Axis(1), &class.columns).view(),
                 first_v,
-                weights.view(),
+                class.weights.view(),
             );
             class.columns.iter().zip(relit).for_each(|(&column, relit)| image_row[column] = relit);
         }
     });
     Ok(image)
+}
+
+/// A projector's rows, lit with one weight each.
+pub(super) struct LitRows<'a> {
+    timing: &'a RowTiming,
+    columns: usize,
+    /// Spread by the beam where pixels have no response of their own.
+    weights: Array1<f64>,
+    beam: RelitBeam,
+}
+
+/// Pixels of a camera row that look at the same projector row with the same response.
+pub(super) struct LitClass {
+    pub columns: Vec<usize>,
+    pub own_row: i64,
+    /// What the light of each projector row counts for, `[projector rows]`.
+    pub weights: Array1<f64>,
+}
+
+impl LitClass {
+    /// What the light of relative row `u` counts for.
+    pub fn weight(&self, u: i32) -> f64 {
+        usize::try_from(self.own_row + i64::from(u))
+            .ok()
+            .and_then(|v| self.weights.get(v))
+            .copied()
+            .unwrap_or(0.0)
+    }
+}
+
+impl<'a> LitRows<'a> {
+    /// Those of `weights`, `[projector rows]`, for an image with this number of columns.
+    pub fn new(
+        timing: &'a RowTiming,
+        columns: usize,
+        weights: ArrayView1<f64>,
+        beam: RelitBeam,
+    ) -> Result<Self, PlaneError> {
+        check_shape("weights", "[projector rows]", &[weights.len()], &[timing.projector_rows()])?;
+        timing.check_columns(columns)?;
+        let weights = match beam {
+            RelitBeam::AsLit if timing.response().is_none() => {
+                Array1::from(timing.beam().spread(weights.to_vec()))
+            }
+            RelitBeam::AsLit | RelitBeam::Ideal => weights.to_owned(),
+        };
+        Ok(Self { timing, columns, weights, beam })
+    }
+
+    /// The classes of camera row `t`.
+    pub fn classes(&self, t: usize) -> Vec<LitClass> {
+        let weights = || self.weights.clone();
+        let Some(response) = self.timing.response() else {
+            let own_row = self.timing.camera().own_row(t) as i64;
+            return vec![LitClass { columns: (0..self.columns).collect(), own_row, weights: weights() }];
+        };
+        let classes = response.classes(t, 0..self.columns, PLACE_STEPS).into_iter();
+        classes
+            .map(|class| LitClass {
+                weights: match self.beam {
+                    RelitBeam::AsLit => {
+                        collected_rows(self.weights.view(), &class.shares, 0, self.weights.len())
+                    }
+                    RelitBeam::Ideal => weights(),
+                },
+                own_row: class.own_row,
+                columns: class.columns,
+            })
+            .collect()
+    }
 }
 
 /// Relights pixels whose profiles, `[reach, pixels]`, begin at projector row `first_v`.

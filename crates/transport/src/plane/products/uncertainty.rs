@@ -1,13 +1,16 @@
-use std::ops::RangeInclusive;
+use std::ops::{Range, RangeInclusive};
 
-use ndarray::{Array1, Array2, Array3, ArrayView1, ArrayView2, ArrayView3, ArrayViewMut2, Axis};
+use ndarray::{
+    Array1, Array2, Array3, ArrayView1, ArrayView2, ArrayView3, ArrayViewMut1, ArrayViewMut2, Axis,
+};
 
 use super::super::board::CalibrationCovariance;
 use super::super::error::check_shape;
 use super::super::noise::check_shapes;
 use super::super::solve::pivot::minimise_free;
-use super::super::solve::tiles::{Objectives, Problem, Row, Spike, Tile, TileWork};
+use super::super::solve::tiles::{Objectives, Problem, Row, Spike, Tile};
 use super::super::{NoiseModel, PlaneError, Prior, RowTiming, Setting, SimdLevel, SlotKind, Transport};
+use super::relight::{LitClass, LitRows, RelitBeam};
 use super::sensitivity::changes;
 
 /// The uncertainty of a transport due to the noise of its stack and the errors of the calibration.
@@ -86,27 +89,28 @@ impl Uncertainty<'_> {
         let (_, rows, columns) = transport.t.dim();
         let expected = [self.timing.camera_rows(), columns];
         check_shape("transport", "[camera rows, columns]", &[rows, columns], &expected)?;
-        self.of_bands_in_rows(0, transport, samples, bands)
+        self.of_sums_in_rows(0, transport, samples, &LightSums::Bands(bands))
     }
 
-    /// [`Self::of_bands`] for `transport` and `samples` that contain only the camera rows starting at `first_row`.
+    /// Standard deviation of sums of the light, `[sums, t, s]`, in the units of the transport. `transport` and `samples`
+    /// contain only the camera rows starting at `first_row`.
     ///
     /// # Errors
     /// Those of [`Self::of_bands`]; [`PlaneError::Rows`] for rows that do not exist in the camera.
-    pub fn of_bands_in_rows(
+    pub fn of_sums_in_rows(
         &self,
         first_row: usize,
         transport: &Transport,
         samples: &Samples,
-        bands: &[Vec<RangeInclusive<i32>>],
+        sums: &LightSums,
     ) -> Result<Array3<f32>, PlaneError> {
-        self.for_each_tile(first_row, transport, samples, bands, &|problem, tile, rows| {
-            let gains = problem.solutions(bands, transport.u_min, tile, rows)?.dot(&problem.weights.t());
+        self.for_each_tile(first_row, transport, samples, sums, &|problem, tile, rows, sums| {
+            let gains = problem.solutions(sums, transport.u_min, tile, rows)?.dot(&problem.weights.t());
             let light = problem.light(transport.u_min, tile, rows);
             let t = first_row + rows[tile.pixels[0].0].data.t;
             let systematic = self.systematic(t, problem, tile, &light, &gains);
-            let of_pixels = gains.axis_chunks_iter(Axis(0), bands.len());
-            let of_pixels = of_pixels.zip(systematic.axis_chunks_iter(Axis(0), bands.len()));
+            let of_pixels = gains.axis_chunks_iter(Axis(0), sums.len());
+            let of_pixels = of_pixels.zip(systematic.axis_chunks_iter(Axis(0), sums.len()));
             for ((gains, systematic), &(at, column)) in of_pixels.zip(&tile.pixels) {
                 let Data { t, out, .. } = &mut rows[at].data;
                 let pixel = Pixel::new(self, samples, &problem.settings, *t, column);
@@ -120,31 +124,31 @@ impl Uncertainty<'_> {
         })
     }
 
-    /// Size of the bias that the prior gives to each band, `[bands, t, s]`.
+    /// Size of the bias that the prior gives to each sum, `[sums, t, s]`.
     ///
-    /// Without noise, the estimate of a band differs from the truth by `alpha (D g)'(D T) + beta/2 sum(g)`, where `g =
-    /// H_FF^-1 e` for the band's rows `e`, and `T` the truth. Here the estimate is taken for the truth, and the terms of
+    /// Without noise, the estimate of a sum differs from the truth by `alpha (D g)'(D T) + beta/2 sum(g)`, where `g =
+    /// H_FF^-1 e` for the sum's weights `e`, and `T` the truth. Here the estimate is taken for the truth, and the terms of
     /// the sum by their sizes, so that terms that cancel by chance do not hide the others. Where the truth is rougher
     /// than the estimate shows, the bias may be larger.
     ///
     /// # Errors
-    /// Those of [`Self::of_bands_in_rows`].
+    /// Those of [`Self::of_sums_in_rows`].
     pub fn prior_bias_in_rows(
         &self,
         first_row: usize,
         transport: &Transport,
         samples: &Samples,
-        bands: &[Vec<RangeInclusive<i32>>],
+        sums: &LightSums,
     ) -> Result<Array3<f32>, PlaneError> {
         let prior = self.prior;
-        self.for_each_tile(first_row, transport, samples, bands, &|problem, tile, rows| {
-            let solutions = problem.solutions(bands, transport.u_min, tile, rows)?;
+        self.for_each_tile(first_row, transport, samples, sums, &|problem, tile, rows, sums| {
+            let solutions = problem.solutions(sums, transport.u_min, tile, rows)?;
             let differences = prior.differences(&problem.model.slots);
             let rough = problem.light(transport.u_min, tile, rows).dot(&differences.t());
             let stiff = solutions.dot(&differences.t());
             for (index, &(at, column)) in tile.pixels.iter().enumerate() {
-                for (band, sd) in rows[at].data.out.column_mut(column).iter_mut().enumerate() {
-                    let row = index * bands.len() + band;
+                for (sum, sd) in rows[at].data.out.column_mut(column).iter_mut().enumerate() {
+                    let row = index * sums.len() + sum;
                     let smoothed =
                         stiff.row(row).iter().zip(rough.row(index)).map(|(a, b)| (a * b).abs()).sum::<f64>();
                     let sparse = solutions.row(row).sum().abs();
@@ -156,19 +160,20 @@ impl Uncertainty<'_> {
     }
 
     /// Calls `work` for the pixels of the camera rows starting at `first_row`, and returns its results,
-    /// `[bands, t, s]`.
+    /// `[sums, t, s]`.
     fn for_each_tile(
         &self,
         first_row: usize,
         transport: &Transport,
         samples: &Samples,
-        bands: &[Vec<RangeInclusive<i32>>],
-        work: &impl for<'r> TileWork<Data<'r>>,
+        sums: &LightSums,
+        work: &(impl for<'r> Fn(&Problem, &Tile, &mut [Row<Data<'r>>], &Sums) -> Result<(), PlaneError> + Sync),
     ) -> Result<Array3<f32>, PlaneError> {
         self.check(first_row, transport, samples)?;
         let (_, rows, columns) = transport.t.dim();
-        let mut out = Array3::zeros((bands.len(), rows, columns));
-        if bands.is_empty() {
+        let sums = Sums::new(sums, self.timing, first_row..first_row + rows, columns)?;
+        let mut out = Array3::zeros((sums.len(), rows, columns));
+        if sums.len() == 0 {
             return Ok(out);
         }
         let mut judged: Vec<Row<Data>> = out
@@ -191,7 +196,7 @@ impl Uncertainty<'_> {
             }
             let masked =
                 tile.valid.as_ref().map(|valid| problem.of_samples(valid.view(), &prior)).transpose()?;
-            work(masked.as_ref().unwrap_or(problem), tile, rows)
+            work(masked.as_ref().unwrap_or(problem), tile, rows, &sums)
         };
         objectives.for_each_tile(&mut judged, &|| true, &of_samples)?;
         Ok(out)
@@ -240,6 +245,63 @@ impl Uncertainty<'_> {
     }
 }
 
+/// Weighted sums of a pixel's light over relative rows.
+#[derive(Debug, Clone, Copy)]
+pub enum LightSums<'a> {
+    /// Bands: lists of ranges, whose rows all have the weight 1.
+    Bands(&'a [Vec<RangeInclusive<i32>>]),
+    /// One: the image that [`super::relight_rows`] makes with these weights of the projector's rows.
+    Relit {
+        /// `[projector rows]`
+        weights: ArrayView1<'a, f64>,
+        /// Whether rows spread.
+        beam: RelitBeam,
+    },
+}
+
+/// The same with the weights of each pixel.
+enum Sums<'a> {
+    /// Over relative rows, each with weight 1.
+    Bands(&'a [Vec<RangeInclusive<i32>>]),
+    /// One, over all rows: the light under some of the projector's. Classes by camera row, from the first one.
+    Relit(Vec<Vec<LitClass>>),
+}
+
+impl<'a> Sums<'a> {
+    fn new(
+        of: &LightSums<'a>,
+        timing: &RowTiming,
+        camera_rows: Range<usize>,
+        columns: usize,
+    ) -> Result<Self, PlaneError> {
+        Ok(match *of {
+            LightSums::Bands(bands) => Self::Bands(bands),
+            LightSums::Relit { weights, beam } => {
+                let lit = LitRows::new(timing, columns, weights, beam)?;
+                Self::Relit(camera_rows.map(|t| lit.classes(t)).collect())
+            }
+        })
+    }
+
+    fn len(&self) -> usize {
+        match self {
+            Self::Bands(bands) => bands.len(),
+            Self::Relit(_) => 1,
+        }
+    }
+
+    /// What the light of relative row `u` of a pixel, its camera row counted from the first one, counts for.
+    fn weight(&self, index: usize, (t, column): (usize, usize), u: i32) -> f64 {
+        match self {
+            Self::Bands(bands) => f64::from(u8::from(bands[index].iter().any(|range| range.contains(&u)))),
+            Self::Relit(rows) => rows[t]
+                .iter()
+                .find(|class| class.columns.binary_search(&column).is_ok())
+                .map_or(0.0, |class| class.weight(u)),
+        }
+    }
+}
+
 /// A camera row to be processed.
 struct Data<'a> {
     /// Its index in the stack.
@@ -251,24 +313,25 @@ struct Data<'a> {
 }
 
 impl Problem<'_> {
-    /// `H_FF^-1 e` for the rows `e` of each band and the free rows `F` of each pixel of a tile, `[pixels * bands,
-    /// slots]`. Times the weights it is the derivative of the band with respect to each sample.
+    /// `H_FF^-1 e` for the weights `e` of each sum and the free rows `F` of each pixel of a tile, `[pixels * sums,
+    /// slots]`. Times the weights it is the derivative of the sum with respect to each sample.
     fn solutions(
         &self,
-        bands: &[Vec<RangeInclusive<i32>>],
+        sums: &Sums,
         u_min: i32,
         tile: &Tile,
         rows: &[Row<Data>],
     ) -> Result<Array2<f64>, PlaneError> {
-        let sums = self.sums(bands);
         let places: Vec<(usize, usize)> = self.places(u_min).collect();
-        let shape = (tile.pixels.len() * bands.len(), self.model.slots.len());
+        let shape = (tile.pixels.len() * sums.len(), self.model.slots.len());
         let mut linear = Array2::zeros(shape);
         let mut free = Array2::from_elem(shape, true);
-        let of_pixels = linear.axis_chunks_iter_mut(Axis(0), bands.len());
-        let of_pixels = of_pixels.zip(free.axis_chunks_iter_mut(Axis(0), bands.len()));
+        let of_pixels = linear.axis_chunks_iter_mut(Axis(0), sums.len());
+        let of_pixels = of_pixels.zip(free.axis_chunks_iter_mut(Axis(0), sums.len()));
         for ((mut linear, mut free), &(at, column)) in of_pixels.zip(&tile.pixels) {
-            linear.assign(&sums);
+            for (index, row) in linear.rows_mut().into_iter().enumerate() {
+                self.put_weights(row, |u| sums.weight(index, (rows[at].data.t, column), u));
+            }
             let lit = self.lit(&places, rows[at].data.profiles.column(column));
             free.rows_mut().into_iter().for_each(|mut free| free.assign(&lit));
         }
@@ -279,20 +342,15 @@ impl Problem<'_> {
         }
     }
 
-    /// The weight of each unknown in the light of each band, `[bands, slots]`.
-    fn sums(&self, bands: &[Vec<RangeInclusive<i32>>]) -> Array2<f64> {
-        let slots = &self.model.slots;
-        let mut sums = Array2::from_shape_fn((bands.len(), slots.len()), |(band, slot)| {
-            let inside = bands[band].iter().any(|range| range.contains(&slots[slot].u));
-            f64::from(u8::from(slots[slot].kind == SlotKind::Own && inside))
-        });
-        if let Some(Spike { own, neighbour, share }) = self.spike {
-            for mut sums in sums.rows_mut() {
-                sums[own] =
-                    (1.0 - share) * sums[own] + neighbour.map_or(0.0, |neighbour| share * sums[neighbour]);
-            }
+    /// The weight of each unknown in a sum in which the light of relative row `u` has the weight `weight(u)`, `[slots]`.
+    fn put_weights(&self, mut of_slots: ArrayViewMut1<f64>, weight: impl Fn(i32) -> f64) {
+        for (of_slot, slot) in of_slots.iter_mut().zip(&self.model.slots) {
+            *of_slot = if slot.kind == SlotKind::Own { weight(slot.u) } else { 0.0 };
         }
-        sums
+        if let Some(Spike { own, neighbour, share }) = self.spike {
+            of_slots[own] = (1.0 - share) * of_slots[own]
+                + neighbour.map_or(0.0, |neighbour| share * of_slots[neighbour]);
+        }
     }
 
     /// The unknowns that are free in a pixel's profile, by slot. Those that are not part of the profile count as
