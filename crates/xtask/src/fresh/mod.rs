@@ -206,7 +206,7 @@ mod tests {
 
     #[test]
     fn only_a_rust_in_a_folder_of_its_own_is_lent() {
-        assert!(lendable(Path::new("/usr")).unwrap_err().contains("with all other programs"));
+        assert!(lendable(Path::new("/usr")).unwrap_err().contains("among all other programs"));
         assert!(lendable(Path::new("/nowhere")).unwrap_err().contains("no bin/cargo"));
     }
 
