@@ -17,10 +17,7 @@ use crate::judge::{
     Files, Stored, Verdict, command, copy, files_of, has_ended, raysweep, results_of, stored, text,
 };
 use crate::kinds::Kind;
-use crate::process::Process;
-
-/// A run that has not come so far after this time hangs: a busy machine takes a minute.
-const HUNG: Duration = Duration::from_secs(600);
+use crate::process::{HUNG, Process};
 
 /// A session that nothing interrupted, in the folder in which others of its kind are killed.
 pub struct Reference<'a> {

@@ -11,11 +11,14 @@ use raysweep_drivers::mirror::{
 };
 use raysweep_sim::mirror::{
     Held, MechanicsConfig, MirrorPty, MtiController, OptotuneController, SerialLink, WireFaults,
+    run_as_soon_as_awake,
 };
 
 use crate::rig::{LIMITS, Rig, play};
 
+/// The calling thread gets real-time priority: a host that is late by 100 ms ends a path with light.
 pub fn rig(pty: MirrorPty) -> Rig {
+    run_as_soon_as_awake();
     Rig { pty, folder: tempfile::tempdir().unwrap() }
 }
 

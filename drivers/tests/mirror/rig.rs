@@ -86,7 +86,8 @@ impl Rig {
         self.assert_parked_with_steps(half_a_write.max(LIMITS.max_step.0 / 6.5 * 2047.0))
     }
 
-    fn assert_parked_with_steps(&self, most_codes: f64) -> Timing {
+    /// Waits until the mirror is parked; checks that the light went off first.
+    pub fn await_parked(&self) {
         let began = Instant::now();
         loop {
             let parked = self.pty.look(|truth| truth.parked_since_ns.zip(truth.dark_since_ns));
@@ -97,6 +98,10 @@ impl Rig {
             assert!(began.elapsed() < HUNG, "not parked");
             std::thread::sleep(Duration::from_millis(5));
         }
+    }
+
+    fn assert_parked_with_steps(&self, most_codes: f64) -> Timing {
+        self.await_parked();
         let truth = self.pty.truth();
         let step = largest_step(&truth.held);
         // Two codes: rounding at both ends.

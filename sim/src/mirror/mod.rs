@@ -13,4 +13,4 @@ pub use mti::MtiController;
 pub use optotune::OptotuneController;
 pub use plant::{Held, MirrorTruth, Plant};
 pub use playzerx::{PlayzerXController, PlayzerXControllerConfig};
-pub use pty::{Controller, MirrorPty, Pty, Run, SerialLink, WireFaults};
+pub use pty::{Controller, MirrorPty, Pty, Run, SerialLink, WireFaults, run_as_soon_as_awake};

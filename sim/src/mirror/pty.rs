@@ -11,8 +11,10 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use nix::fcntl::OFlag;
+use nix::mount::{MsFlags, mount};
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::pty::{grantpt, posix_openpt, ptsname_r, unlockpt};
+use nix::sched::{CloneFlags, unshare};
 use raysweep_core::Clock;
 use thread_priority::{
     RealtimeThreadSchedulePolicy, ThreadPriority, ThreadSchedulePolicy, set_thread_priority_and_policy,
@@ -73,11 +75,13 @@ pub struct Pty {
 }
 
 impl Pty {
-    /// Plugs in a device.
+    /// Plugs in a device. If permitted, at a pseudo-terminal that only the calling thread sees, and what it starts from
+    /// then on.
     ///
     /// # Errors
     /// When a pseudo-terminal or a thread cannot be created.
     pub fn plug(run: Run, link: SerialLink, faults: WireFaults) -> io::Result<Self> {
+        OWN_TERMINALS.with(|()| ());
         // Close-on-exec: a process started by a test must not keep an unplugged controller's port alive. The other end
         // is left to the driver, which can open and close it like a real port.
         let master = posix_openpt(OFlag::O_RDWR | OFlag::O_NOCTTY | OFlag::O_NONBLOCK | OFlag::O_CLOEXEC)?;
@@ -200,9 +204,32 @@ fn run_of(mut controller: impl Controller) -> Run {
     Box::new(move |bytes: &[u8], now_ns, replies: &mut Vec<u8>| controller.run(bytes, now_ns, replies))
 }
 
+thread_local! {
+    /// The kernel gives the number of an unplugged terminal to the next one. Whoever still holds the path of a device
+    /// that is gone, such as a guardian that wants to park it, would then talk to the device of another test.
+    static OWN_TERMINALS: () = {
+        // Without the permission, terminals are shared with the rest of the machine.
+        let _ = own_terminals();
+    };
+}
+
+/// Mounts an instance of devpts for the calling thread alone.
+fn own_terminals() -> nix::Result<()> {
+    unshare(CloneFlags::CLONE_NEWNS)?;
+    let none = None::<&str>;
+    mount(none, "/", none, MsFlags::MS_REC | MsFlags::MS_PRIVATE, none)?;
+    mount(
+        Some("devpts"),
+        "/dev/pts",
+        Some("devpts"),
+        MsFlags::empty(),
+        Some("newinstance,ptmxmode=0666,mode=620"),
+    )
+}
+
 /// Gives the calling thread real-time priority, if permitted: a real controller has its own processor and answers in
-/// time however busy the host is.
-fn run_as_soon_as_awake() {
+/// time however busy the host is. For hosts that must not be late, too.
+pub fn run_as_soon_as_awake() {
     let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
     let _ = set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Min, policy);
 }
@@ -281,5 +308,29 @@ impl Wire {
 
     fn draw(&self, key: &[u64]) -> f64 {
         uniform(&mut keyed(self.faults.seed, Purpose::MirrorWire, key))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A device that sends what it hears back, with a mark of its own.
+    fn echo(mark: u8) -> Pty {
+        let run = move |bytes: &[u8], _: i64, replies: &mut Vec<u8>| {
+            replies.extend(bytes.iter().flat_map(|byte| [mark, *byte]));
+        };
+        Pty::plug(Box::new(run), SerialLink::VirtualCom, WireFaults::default()).unwrap()
+    }
+
+    #[test]
+    fn the_path_of_an_unplugged_device_does_not_lead_to_that_of_another_thread() {
+        let (mut gone, other) = (echo(b'a'), std::thread::spawn(|| echo(b'b')));
+        let path = gone.path().to_owned();
+        gone.unplug();
+        let other = other.join().unwrap();
+        // Each has the first number, for neither sees the other's.
+        assert_eq!((path.as_path(), other.path()), (Path::new("/dev/pts/0"), Path::new("/dev/pts/0")));
+        assert!(!path.exists());
     }
 }
