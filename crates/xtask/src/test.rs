@@ -24,7 +24,9 @@ pub fn test(wanted: Guest) -> Done {
     run(cargo().args(["clippy", "--workspace", "--all-targets", "--all-features", "--", "-D", "warnings"]))?;
     // A separate workspace, which nothing else compiles; in the same folder, it shares what the lints have built.
     run(cargo().args(["check", "--manifest-path", "fuzz/Cargo.toml", "--target-dir"]).arg(target()))?;
-    run(cargo().args(["test", "--workspace", "--all-features"]).env("RAYSWEEP_PYTHON", python))?;
+    // All failures at once: the next look at them is half an hour away.
+    let tests = ["test", "--workspace", "--all-features", "--no-fail-fast"];
+    run(cargo().args(tests).env("RAYSWEEP_PYTHON", python))?;
     match wanted {
         Guest::Run => guest::guest(&[]),
         Guest::Skip => {

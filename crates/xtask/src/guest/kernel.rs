@@ -117,7 +117,10 @@ fn package_name() -> Done<String> {
         .map_err(|error| format!("cannot start apt-cache: {error}"))?;
     let text = String::from_utf8_lossy(&output.stdout);
     let name = text.lines().find_map(|line| line.trim().strip_prefix("Depends: "));
-    name.map(str::to_owned).ok_or_else(|| format!("apt knows no package {META_PACKAGE}"))
+    name.map(str::to_owned).ok_or_else(|| format!(
+            "apt knows no package {META_PACKAGE}, Debian's kernel, which the guest runs; elsewhere leave the guest out: \
+             `cargo xtask test --no-guest`"
+        ))
 }
 
 fn download_package(name: &str, folder: &Path) -> Done {

@@ -136,7 +136,7 @@ fn still_missing(missing: &[Missing]) -> Done {
         return Ok(());
     }
     Err(format!(
-        "installed, but what they are needed for is still not found ({PATH} says how it is looked for):\n{}",
+        "installed, but what they are needed for is still not found ({PATH} says how it is looked for):\n{}\n{ELSEWHERE}",
         lines(missing)
     ))
 }
