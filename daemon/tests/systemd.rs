@@ -10,7 +10,6 @@ use std::os::unix::fs::MetadataExt;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
-use std::time::Duration;
 
 use nix::sys::signal::Signal;
 use process::{Process, wait_for};
@@ -154,8 +153,9 @@ fn log_lines_have_a_priority_and_no_time_and_an_idle_daemon_ends_on_request() {
         UnixStream::connect(folder.path().join("socket")).ok()
     });
     // The signals are handled before the daemon listens to anybody.
-    wait_for("no word of it", || fs::read_to_string(&log).unwrap().contains("listening").then_some(()));
-    std::thread::sleep(Duration::from_millis(200));
+    wait_for("the daemon does not log that it listens", || {
+        fs::read_to_string(&log).unwrap().contains("listening").then_some(())
+    });
     daemon.signal(Signal::SIGUSR1);
     assert_eq!(daemon.wait().code(), Some(0));
     let log = fs::read_to_string(log).unwrap();

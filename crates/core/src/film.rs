@@ -27,6 +27,13 @@ pub struct FilmSummary {
     /// calibration, or for a film of few cycles.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub late_us: Option<f64>,
+    /// Standard deviation of the beam in rows, as the first cycles showed it; `None` if they did not, or a calibration
+    /// measured it pixel by pixel.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub beam_sigma_rows: Option<f64>,
+    /// Whether the rows `|u| <= 2` are one band, because no setting tells where in it direct light lies.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub one_band: bool,
     /// How the cycles after the first few were demultiplexed, and why: each a subject and a sentence. Empty for a film
     /// of few cycles.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]

@@ -309,6 +309,9 @@ impl Choices {
         stack.settings.iter_mut().for_each(|setting| *setting = setting.earlier(self.late_us));
         let inner = rows.start - held_from..rows.end - held_from;
         let mut coupled = None;
+        if !go_on() {
+            return Err(PlaneError::Stopped);
+        }
         if let Some((noise, coupling)) = self.noise.zip(self.coupling) {
             let Coupled { stack: images, variance_ratio } = if self.steady.len() == stack.settings.len() {
                 couple(&coupling, &noise, stack)?

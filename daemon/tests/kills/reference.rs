@@ -26,6 +26,8 @@ pub struct Reference<'a> {
     /// Away from the data folder.
     session: PathBuf,
     run_time: Usual,
+    /// Of resumed runs, which are shorter.
+    resume_time: Usual,
     process_time: Usual,
     /// What was stored, in the order of the lines.
     stored: Vec<Stored>,
@@ -84,9 +86,10 @@ impl<'a> Reference<'a> {
         fs::remove_dir_all(&made).unwrap();
         let (stored, files) = (stored(&session), files_of(&session));
         let made = RefCell::default();
-        let (run_time, process_time) = (Usual::new(run_time), Usual::new(Duration::ZERO));
+        let [run_time, resume_time, process_time] = [run_time, run_time, Duration::ZERO].map(Usual::new);
         let results = [results_of(&session), Files::new()];
-        let new = Self { kind, folder, session, run_time, process_time, stored, files, results, made };
+        let new =
+            Self { kind, folder, session, run_time, resume_time, process_time, stored, files, results, made };
         let processed = new.to_be_processed();
         let began = Instant::now();
         new.process(&processed).unwrap();
@@ -140,7 +143,9 @@ impl<'a> Reference<'a> {
         let lines = fs::read_to_string(self.session.join("ledger.jsonl")).unwrap().lines().count();
         let moment = self.moment(random, &self.run_time, lines);
         let (verdict, when) = self.kill_daemon(&moment, |client| drop(client.run(&plan(self.kind.plan))));
-        self.run_time.learn(&verdict);
+        if let Moment::After(_) = moment {
+            self.run_time.learn(&verdict);
+        }
         (verdict, when)
     }
 
@@ -152,9 +157,9 @@ impl<'a> Reference<'a> {
         let session = self.data().join(self.session.file_name().unwrap());
         copy(&self.session, &session);
         cut(&session, &lines[..kept].concat());
-        let moment = self.moment(random, &self.run_time, 0);
+        let moment = self.moment(random, &self.resume_time, 0);
         let (verdict, when) = self.kill_daemon(&moment, |client| drop(client.resume(&session)));
-        self.run_time.learn(&verdict);
+        self.resume_time.learn(&verdict);
         (verdict, format!("resumed after line {kept}, {when}"))
     }
 

@@ -24,6 +24,9 @@ use rig::{Faults, Laboratory, PLANS, RigKind};
 use tokio::sync::broadcast::Receiver;
 use tokio::sync::broadcast::error::TryRecvError;
 
+/// How long any answer may take, on a machine that does something else too.
+const LONGEST_ANSWER: Duration = Duration::from_secs(60);
+
 /// Sequences in each run of the tests, for each rig.
 const CASES: u32 = 10;
 
@@ -133,7 +136,7 @@ impl Watch {
 fn answered<T>(what: &str, request: impl FnOnce() -> T) -> T {
     let began = Instant::now();
     let answer = request();
-    assert!(began.elapsed() < HUNG, "{what} was answered after {:?}", began.elapsed());
+    assert!(began.elapsed() < LONGEST_ANSWER, "{what} was answered after {:?}", began.elapsed());
     answer
 }
 

@@ -325,6 +325,9 @@ mod tests {
 
     #[test]
     fn the_path_of_an_unplugged_device_does_not_lead_to_that_of_another_thread() {
+        if std::thread::spawn(own_terminals).join().unwrap().is_err() {
+            return eprintln!("SKIPPED: this machine forbids mounts of one's own");
+        }
         let (mut gone, other) = (echo(b'a'), std::thread::spawn(|| echo(b'b')));
         let path = gone.path().to_owned();
         gone.unplug();

@@ -78,9 +78,9 @@ impl Assembly {
                     return Err(not_made(what.into()));
                 }
             },
-            ProductKind::Epipolar(width) => width.of_stack(stack).epipolar(name, transport, mask),
-            ProductKind::NonEpipolar(width) => width.of_stack(stack).non_epipolar(name, transport, mask),
-            ProductKind::Band(band) => band.of_stack(stack).make(name, transport, mask),
+            ProductKind::Epipolar(width) => width.of(stack.one_band).epipolar(name, transport, mask),
+            ProductKind::NonEpipolar(width) => width.of(stack.one_band).non_epipolar(name, transport, mask),
+            ProductKind::Band(band) => band.of(stack.one_band).make(name, transport, mask),
             ProductKind::Relight(pattern) => pattern
                 .make(name, &stack.timing, first_row, transport, mask)
                 .map_err(|error| not_made(error.to_string()))?,

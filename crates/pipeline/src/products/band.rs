@@ -7,7 +7,6 @@ use raysweep_transport::plane::Transport;
 use serde::Deserialize;
 
 use crate::product::Product;
-use crate::stack::SweepStack;
 
 /// The reach of a transport as text, for products that are limited by it.
 pub(super) fn reach_of(transport: &Transport) -> String {
@@ -66,8 +65,8 @@ impl Width {
     }
 
     /// At least the band whose division the settings do not tell.
-    pub(super) fn of_stack(self, stack: &SweepStack) -> Self {
-        let narrowest_rows = if stack.one_band { 2 * ONE_BAND_ROWS + 1 } else { 1 };
+    pub(super) fn of(self, one_band: bool) -> Self {
+        let narrowest_rows = if one_band { 2 * ONE_BAND_ROWS + 1 } else { 1 };
         Self { width_rows: self.width_rows.max(narrowest_rows) }
     }
 
@@ -140,15 +139,13 @@ impl Band {
     }
 
     /// The band without a part of the rows whose division the settings do not tell: all of them, or none.
-    pub(super) fn of_stack(self, stack: &SweepStack) -> Self {
+    pub(super) fn of(self, one_band: bool) -> Self {
         match self {
-            Self { from_rows, to_rows, side } if stack.one_band && from_rows <= ONE_BAND_ROWS => {
-                match to_rows {
-                    Some(to_rows) if to_rows <= ONE_BAND_ROWS => Self::new(0, Some(ONE_BAND_ROWS)),
-                    _ if from_rows == 0 && side.is_none() => self,
-                    _ => Self { from_rows: ONE_BAND_ROWS + 1, ..self },
-                }
-            }
+            Self { from_rows, to_rows, side } if one_band && from_rows <= ONE_BAND_ROWS => match to_rows {
+                Some(to_rows) if to_rows <= ONE_BAND_ROWS => Self::new(0, Some(ONE_BAND_ROWS)),
+                _ if from_rows == 0 && side.is_none() => self,
+                _ => Self { from_rows: ONE_BAND_ROWS + 1, ..self },
+            },
             _ => self,
         }
     }

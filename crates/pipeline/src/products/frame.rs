@@ -26,17 +26,23 @@ impl ProductSpec {
         Some(format!("product {}: {what}", self.name))
     }
 
-    /// Its image of one transport, `[t, s]`, and what it shows, in one sentence.
+    /// Its image of one transport, `[t, s]`, and what it shows, in one sentence. `one_band`: whether the rows
+    /// `|u| <= 2` cannot be told apart.
     ///
     /// # Errors
     /// If it is not one of a film, or the transport does not fit the timing.
-    pub fn frame(&self, timing: &RowTiming, transport: &Transport) -> Result<(Array2<f32>, String), NotMade> {
+    pub fn frame(
+        &self,
+        timing: &RowTiming,
+        transport: &Transport,
+        one_band: bool,
+    ) -> Result<(Array2<f32>, String), NotMade> {
         let not_made = |what: String| NotMade { name: self.name.clone(), what };
         let (name, mask) = (self.name.clone(), Array2::zeros((0, 0)));
         let product = match &self.kind {
-            ProductKind::Epipolar(width) => width.epipolar(name, transport, mask),
-            ProductKind::NonEpipolar(width) => width.non_epipolar(name, transport, mask),
-            ProductKind::Band(band) => band.make(name, transport, mask),
+            ProductKind::Epipolar(width) => width.of(one_band).epipolar(name, transport, mask),
+            ProductKind::NonEpipolar(width) => width.of(one_band).non_epipolar(name, transport, mask),
+            ProductKind::Band(band) => band.of(one_band).make(name, transport, mask),
             ProductKind::Relight(relight) => {
                 relight.make(name, timing, 0, transport, mask).map_err(|error| not_made(error.to_string()))?
             }

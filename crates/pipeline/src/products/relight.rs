@@ -156,33 +156,36 @@ impl Relight {
         let reach = reach_of(transport);
         let under =
             |weights: &Array1<f64>| relight_rows(timing, first_row, transport, weights.view(), self.beam);
-        if let RowPattern::Line(line) = &self.pattern {
-            let tops = line.first_rows(timing);
-            let (_, height, width) = transport.t.dim();
-            let mut images = Array3::zeros((tops.len(), height, width));
-            for (mut image, &top) in images.axis_iter_mut(Axis(0)).zip(&tops) {
-                let lit = top..top + line.height_rows;
-                let weights = Array1::from_shape_fn(rows, |row| if lit.contains(&row) { 1.0 } else { 0.0 });
-                image.assign(&under(&weights)?);
+        let (says, weights) = match self.weights(rows) {
+            Ok(of_rows) => of_rows,
+            Err(line) => {
+                let tops = line.first_rows(timing);
+                let (_, height, width) = transport.t.dim();
+                let mut images = Array3::zeros((tops.len(), height, width));
+                for (mut image, &top) in images.axis_iter_mut(Axis(0)).zip(&tops) {
+                    let lit = top..top + line.height_rows;
+                    let weights =
+                        Array1::from_shape_fn(rows, |row| if lit.contains(&row) { 1.0 } else { 0.0 });
+                    image.assign(&under(&weights)?);
+                }
+                return Ok(Product::Sequence {
+                    name,
+                    about: format!(
+                        "relit by a line of {} rows that moves down the projector; {reach}",
+                        line.height_rows
+                    ),
+                    axis: "first lit projector row".into(),
+                    at: tops.into_iter().map(|top| top as f64).collect(),
+                    images,
+                    mask,
+                });
             }
-            return Ok(Product::Sequence {
-                name,
-                about: format!(
-                    "relit by a line of {} rows that moves down the projector; {reach}",
-                    line.height_rows
-                ),
-                axis: "first lit projector row".into(),
-                at: tops.into_iter().map(|top| top as f64).collect(),
-                images,
-                mask,
-            });
-        }
-        let (says, weights) = self.weights(rows).unwrap_or_default();
+        };
         Ok(Product::Image { name, about: format!("{says}; {reach}"), image: under(&weights)?, mask })
     }
 
-    /// The pattern as text, and the brightness of each of the projector's rows; `None` for a sequence.
-    pub(super) fn weights(&self, rows: usize) -> Option<(String, Array1<f64>)> {
+    /// The pattern as text, and the brightness of each of the projector's rows; or the line of a sequence.
+    pub(super) fn weights(&self, rows: usize) -> Result<(String, Array1<f64>), MovingLine> {
         match &self.pattern {
             RowPattern::Rows(pieces) => {
                 let mut weights = Array1::zeros(rows);
@@ -194,15 +197,15 @@ impl Relight {
                         .for_each(|w| *w += piece.weight);
                 }
                 let lit = weights.iter().filter(|&&weight| weight > 0.0).count();
-                Some((format!("relit by {lit} of the projector's {rows} rows"), weights))
+                Ok((format!("relit by {lit} of the projector's {rows} rows"), weights))
             }
             RowPattern::Stripes(Stripes { period_rows, lit_rows, phase_rows }) => {
                 let lit =
                     |row: usize| (row % period_rows + period_rows - phase_rows) % period_rows < *lit_rows;
                 let says = format!("relit by stripes of {lit_rows} rows, {period_rows} rows apart");
-                Some((says, Array1::from_shape_fn(rows, |row| if lit(row) { 1.0 } else { 0.0 })))
+                Ok((says, Array1::from_shape_fn(rows, |row| if lit(row) { 1.0 } else { 0.0 })))
             }
-            RowPattern::Line(_) => None,
+            RowPattern::Line(line) => Err(*line),
         }
     }
 

@@ -207,13 +207,14 @@ fn light_of(
 ) -> Result<LightOf, ProductError> {
     let refused = |path: Vec<String>, what: String| ProductError { kind: kind.into(), path, what };
     if options.contains_key("line") {
-        let what = "line: is a sequence of images; give rows or stripes, or from_rows".to_owned();
+        let what = "line: gives a sequence of images; give rows or stripes, or from_rows".to_owned();
         return Err(refused(vec!["line".into()], what));
     }
     let has = |keys: &[&str]| keys.iter().filter(|key| options.contains_key(**key)).count();
     if has(&["rows", "stripes", "beam"]) > 0 {
         if has(&["rows", "stripes"]) != 1 || has(&["from_rows", "to_rows", "side"]) > 0 {
-            let what = "give either from_rows, perhaps with to_rows and side, or one of rows and stripes";
+            let what = "give either from_rows, perhaps with to_rows and side, or one of rows and stripes, perhaps with \
+                        beam";
             return Err(refused(Vec::new(), what.to_owned()));
         }
         return relight(kind, options, geometry).map(LightOf::Relit);

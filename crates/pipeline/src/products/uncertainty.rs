@@ -92,12 +92,13 @@ impl LightOf {
         let make = |sums: &LightSums<'_>| image(stack, noise, |model, samples| make(model, samples, sums));
         match self {
             Self::Band(band) => {
-                let band = band.of_stack(stack);
+                let band = band.of(stack.one_band);
                 Ok((band.says(), make(&LightSums::Bands(&[band.ranges()]))?))
             }
             Self::Relit(relight) => {
-                let (says, weights) =
-                    relight.weights(stack.timing.projector_rows()).ok_or("a sequence has no uncertainty")?;
+                let (says, weights) = relight
+                    .weights(stack.timing.projector_rows())
+                    .map_err(|_line| "a sequence has no uncertainty")?;
                 let says = format!("the scene {says}");
                 Ok((says, make(&LightSums::Relit { weights: weights.view(), beam: relight.beam() })?))
             }

@@ -219,8 +219,7 @@ pub struct BoardPixels {
     pub curve: MeasuredCurve,
     /// White, as all light in counts that are proportional to it.
     pub white: WhiteMap,
-    /// The room's light, and the run whose clock its flicker has; `None` if too few of its frames have time stamps of
-    /// one run.
+    /// The room's light, and the run whose clock its flicker has; `None` if too few of its frames have time stamps.
     pub ambient: Option<(Ambient, u32)>,
     /// The places of single pixels against a smooth map.
     pub places: RowPlaces,
@@ -388,8 +387,8 @@ fn black_frames(taken: &BlackPictures) -> [BlackFrames<'_>; 2] {
     })
 }
 
-/// The room's light, from the black pictures of both exposures: its flicker by the clock of one run, and a level without
-/// flicker from all frames, however many runs took them.
+/// The room's light, from the black pictures of both exposures: its flicker by the clock of one run, and a level
+/// without flicker from all frames, however many runs took them.
 fn room(
     images: &BoardImages<'_>,
     dark: &DarkFit,
@@ -406,8 +405,10 @@ fn room(
         });
         Ok::<_, CalibrationError>([black?, short?])
     };
-    let of_run = taken(Some(run))?;
-    if has_enough(&of_run) {
+    // Dropped before all frames are read.
+    if let of_run = taken(Some(run))?
+        && has_enough(&of_run)
+    {
         let usable = dark.hot.mapv(|hot| !hot);
         let geometry = &images.task.task.geometry;
         let (row_time_us, rate_hz) = (geometry.camera_row_time_us, 1e6 / geometry.raster.period_us);

@@ -13,7 +13,7 @@ use raysweep_session::stack::ArrayName;
 use raysweep_transport::plane::Setting;
 
 use super::product::write_products;
-use super::report::{self, note_findings};
+use super::report::{self, forget_findings, note_findings};
 use super::task::{FilmTask, create_transports};
 use crate::plane::{append_argument, manifest, unit_of};
 use crate::stored::{Asked, ProcessError, Processed, Stored};
@@ -97,6 +97,7 @@ fn make_transports(
     let film = session.film()?;
     let transports = create_transports(session, task, solver.reach_rows())?;
     let mut summary = state.film.clone().unwrap_or_default();
+    forget_findings(&mut summary);
     for entry in state.cycles() {
         let frames = match film.read(entry.cycle) {
             Ok(Some(frames)) if crc32(frames.view()) == entry.crc32 => frames,

@@ -7,7 +7,7 @@ use raysweep_session::ledger::State;
 use raysweep_session::products::{VideoWriter, video_tone_map};
 use raysweep_session::report::{Picture, ToneMap};
 use raysweep_session::{Result, Session};
-use raysweep_transport::plane::Transport;
+use raysweep_transport::plane::{Beam, Transport};
 use serde_json::json;
 
 use super::task::FilmTask;
@@ -63,7 +63,12 @@ pub fn write_products(
         made.problems.push("no cycle has a transport, so no product is made".into());
         return Ok(made);
     };
-    let timing = match task.task.geometry.timing() {
+    let found = state.film.clone().unwrap_or_default();
+    let timing = task.task.geometry.timing().and_then(|timing| match found.beam_sigma_rows {
+        Some(sigma_rows) => timing.with_beam(Beam::of_sigma(sigma_rows)),
+        None => Ok(timing),
+    });
+    let timing = match timing {
         Ok(timing) => timing,
         Err(error) => {
             made.problems.push(error.to_string());
@@ -81,7 +86,7 @@ pub fn write_products(
         let transport = Transport::measured(t, u_min, exists);
         let mut sound = Vec::new();
         for mut draft in drafts {
-            match draft.spec.frame(&timing, &transport) {
+            match draft.spec.frame(&timing, &transport, found.one_band) {
                 Ok((image, about)) => {
                     draft.append(session, task, &cycles, (number, image), about)?;
                     sound.push(draft);

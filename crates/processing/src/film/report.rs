@@ -58,6 +58,18 @@ fn make(
     Ok(page(session, state, facts(state, task), sections))
 }
 
+/// Removes what a film's first cycles showed from its summary.
+pub(super) fn forget_findings(film: &mut FilmSummary) {
+    *film = FilmSummary {
+        late_us: None,
+        beam_sigma_rows: None,
+        one_band: false,
+        findings: Vec::new(),
+        warnings: Vec::new(),
+        ..std::mem::take(film)
+    };
+}
+
 /// Enters what a film's first cycles showed into its summary.
 pub fn note_findings(film: &mut FilmSummary, learned: std::result::Result<&Findings, NotSolved>) {
     match learned {
@@ -65,11 +77,16 @@ pub fn note_findings(film: &mut FilmSummary, learned: std::result::Result<&Findi
             let said = found.remarks.iter().map(|(subject, said)| ((*subject).to_owned(), said.clone()));
             film.findings = said.collect();
             film.late_us = found.late_us;
+            film.beam_sigma_rows = found.beam_sigma_rows;
+            film.one_band = found.one_band;
             film.warnings.clone_from(&found.warnings);
         }
         Err(error) => {
-            film.warnings =
-                vec![format!("demultiplexed as planned, for the first cycles show nothing: {error}")];
+            forget_findings(film);
+            film.warnings = vec![format!(
+                "all cycles are demultiplexed as planned, because nothing could be learned from the first four: {}",
+                error.what
+            )];
         }
     }
 }
@@ -130,6 +147,7 @@ fn cycles(session: &Session, state: &State) -> Result<Section> {
     let transports = TransportFilm::open(&session.transport_film_path()).ok();
     let stored: Vec<_> = state.cycles().collect();
     let shown = SHOWN.min(stored.len());
+    let one_band = state.film.as_ref().is_some_and(|film| film.one_band);
     let mut labels = Vec::new();
     let mut images: Vec<[Array2<f32>; 2]> = Vec::new();
     for place in 0..shown {
@@ -138,12 +156,11 @@ fn cycles(session: &Session, state: &State) -> Result<Section> {
         let read = transports.as_ref().and_then(|film| film.read(entry.cycle).ok().flatten());
         let own_row = transports.as_ref().and_then(|film| film.attributes().get("u_min")?.as_i64());
         if let (Some(transport), Some(u_min)) = (read, own_row) {
+            let rows = transport.len_of(Axis(0)) as i64;
+            let half = if one_band { 2 } else { 0 };
             // If all delays are long, no pixel's own row is in range.
-            let own_row = usize::try_from(-u_min).ok().filter(|&own_row| own_row < transport.len_of(Axis(0)));
-            let epipolar = match own_row {
-                Some(own_row) => transport.slice(s![own_row, .., ..]).to_owned(),
-                None => Array2::zeros((transport.len_of(Axis(1)), transport.len_of(Axis(2)))),
-            };
+            let [first, end] = [-half - u_min, half + 1 - u_min].map(|row| row.clamp(0, rows) as usize);
+            let epipolar = transport.slice(s![first..end, .., ..]).sum_axis(Axis(0));
             let indirect = transport.sum_axis(Axis(0)) - &epipolar;
             labels.push(format!("{} ({:.2} s)", entry.cycle, entry.start_s));
             images.push([epipolar, indirect]);

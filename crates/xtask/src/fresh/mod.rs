@@ -48,7 +48,8 @@ fn chosen(words: &[&str]) -> Done<Vec<&'static Release>> {
     let names = |release: &Release, word: &str| [release.number, release.suite].contains(&word);
     if let Some(unknown) = words.iter().find(|word| !RELEASES.iter().any(|release| names(release, word))) {
         return Err(format!(
-            "unknown release `{unknown}`: use 12 (bookworm), 13 (trixie), or none for both, as in `cargo xtask fresh 12`"
+            "unknown release `{unknown}`: use 12 (bookworm), 13 (trixie), or none for both, as in `cargo xtask fresh \
+             12`"
         ));
     }
     let is_chosen = |release: &&Release| words.is_empty() || words.iter().any(|word| names(release, word));
@@ -172,8 +173,8 @@ fn lendable(sysroot: &Path) -> Done {
     let shown = sysroot.display();
     if sysroot.canonicalize().is_ok_and(|sysroot| sysroot == Path::new("/usr")) {
         return Err(format!(
-            "Rust is installed in {shown} among all other programs; `fresh` mounts the toolchain into a bare Debian and \
-             needs one in a folder of its own: install it from https://rustup.rs"
+            "Rust is installed in {shown} among all other programs; `fresh` mounts the toolchain into a bare Debian \
+             and needs one in a folder of its own: install it from https://rustup.rs"
         ));
     }
     if !sysroot.join("bin/cargo").is_file() {

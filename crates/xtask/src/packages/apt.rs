@@ -57,15 +57,15 @@ fn apt_get(arguments: &[&str]) -> Done {
     apt.args(["-o", "DPkg::Lock::Timeout=600", "-o", "Acquire::Retries=3"]);
     // A question would not be seen.
     apt.args(["-o", "Dpkg::Options::=--force-confold"]).env("DEBIAN_FRONTEND", "noninteractive");
-    apt.args(arguments).stdin(Stdio::null()).env("LC_ALL", "C");
+    apt.args(arguments).stdin(Stdio::null()).stderr(Stdio::inherit()).env("LC_ALL", "C");
     eprintln!("$ apt-get {}", arguments.join(" "));
     let output = apt.output().map_err(|error| format!("cannot start apt-get: {error}"))?;
     let said = String::from_utf8_lossy(&output.stdout);
     if !output.status.success() {
-        eprint!("{said}{}", String::from_utf8_lossy(&output.stderr));
+        eprint!("{said}");
         return Err(format!("`apt-get {}` ended with {}", arguments.join(" "), output.status));
     }
-    removed(&said).map_or(Ok(()), |names| say(&format!("apt removed {names}, which cannot be beside them")))
+    removed(&said).map_or(Ok(()), |names| say(&format!("apt removed {names}, which conflicts with them")))
 }
 
 /// The packages that apt says it removes.

@@ -116,7 +116,8 @@ fn by_hand(missing: &[Missing], known: &[String], is_root: bool) -> String {
     let mut said = format!("install with\n  {}", apt::by_hand(&names, is_root));
     if !unknown.is_empty() {
         said += &format!(
-            "\napt does not know these packages yet, by any name:\n{}\nafter the update, run this command again\n{ELSEWHERE}",
+            "\napt does not know these packages yet, by any name:\n{}\nafter the update, run this command \
+             again\n{ELSEWHERE}",
             lines(unknown)
         );
     }
@@ -136,7 +137,8 @@ fn still_missing(missing: &[Missing]) -> Done {
         return Ok(());
     }
     Err(format!(
-        "installed, but what they are needed for is still not found ({PATH} says how it is looked for):\n{}\n{ELSEWHERE}",
+        "installed, but what they are needed for is still not found ({PATH} says how it is looked \
+         for):\n{}\n{ELSEWHERE}",
         lines(missing)
     ))
 }

@@ -267,7 +267,10 @@ impl Solving {
     }
 
     fn publish(&self, exposed: &CycleFrames, is_sliding: bool, transport: &Transport, solve_time: Duration) {
-        let views = [(EPIPOLAR, transport.epipolar(1)), (INDIRECT, transport.non_epipolar(1))];
+        // Rows that the settings do not tell apart are one band.
+        let width_rows = if self.account.summary().one_band { 5 } else { 1 };
+        let views =
+            [(EPIPOLAR, transport.epipolar(width_rows)), (INDIRECT, transport.non_epipolar(width_rows))];
         if let Some(Outlet { file, session, .. }) = &self.live {
             let entries = [
                 ("axes", json!(["t", "s"])),
@@ -304,7 +307,8 @@ impl Solving {
             solve_ms: solve_time.as_secs_f64() * 1e3,
             epipolar,
             non_epipolar,
-            film: self.account.summary(),
+            // The sentences are in status and at the end.
+            film: FilmSummary { findings: Vec::new(), ..self.account.summary() },
         }));
     }
 }

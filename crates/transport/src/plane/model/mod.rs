@@ -13,7 +13,7 @@ pub(super) use beam::WIDEST_RESPONSE_SIGMA_ROWS;
 pub(super) use forward::drawn;
 pub use forward::{MIN_WEIGHT, RowModel, Slot, SlotKind, predict, reach, relative_rows};
 pub use response::{FIRST_RESPONSE_ROW, PixelResponse, RESPONSE_ROWS, Shares};
-pub(super) use response::{PLACE_STEPS, ResponseClass, collected_rows};
+pub(super) use response::{PLACE_STEPS, ResponseClass, collected, collected_rows};
 pub use setting::{Setting, delay_us, offset_us};
 pub use spot::{FlyingSpot, Scan, settings_on_direct_row, spike_weights};
 pub use timing::{CameraRows, RowTiming};

@@ -157,7 +157,6 @@ impl PixelResponse {
 
 /// `A'` of a pixel with this response for one projector row: light of the row `lit`, collected while the rows around it
 /// are drawn. `drawn` is the share of each projector row's dwell inside the exposure.
-#[cfg(test)]
 pub(in super::super) fn collected(drawn: ArrayView1<f64>, shares: &Shares, lit: i64) -> f64 {
     let of_row = |(d, share): (usize, &f64)| {
         let row = usize::try_from(lit + d as i64 + i64::from(FIRST_RESPONSE_ROW)).ok()?;

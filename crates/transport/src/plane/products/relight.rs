@@ -1,9 +1,11 @@
+use std::sync::Arc;
+
 use ndarray::{Array1, Array2, ArrayView1, ArrayView2, ArrayViewMut1, Axis};
 use rayon::prelude::*;
 
 use super::super::PlaneError;
 use super::super::error::check_shape;
-use super::super::model::{PLACE_STEPS, RowTiming, Transport, collected_rows};
+use super::super::model::{PLACE_STEPS, RowTiming, Shares, Transport, collected};
 
 /// How a projector's rows spread in a relit image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -57,15 +59,7 @@ pub fn relight_rows(
     image.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(at, mut image_row)| {
         let profiles = transport.t.index_axis(Axis(1), at);
         for class in lit.classes(first_row + at) {
-            let mut relit = Array1::zeros(class.columns.len());
-            let first_v = class.own_row + i64::from(transport.u_min);
-            relight_row(
-                relit.view_mut(),
-                profiles.select(Axis(1), &class.columns).view(),
-                first_v,
-                class.weights.view(),
-            );
-            class.columns.iter().zip(relit).for_each(|(&column, relit)| image_row[column] = relit);
+            class.relight(image_row.view_mut(), profiles, transport.u_min);
         }
     });
     Ok(image)
@@ -76,26 +70,42 @@ pub(super) struct LitRows<'a> {
     timing: &'a RowTiming,
     columns: usize,
     /// Spread by the beam where pixels have no response of their own.
-    weights: Array1<f64>,
+    weights: Arc<Array1<f64>>,
     beam: RelitBeam,
 }
 
 /// Pixels of a camera row that look at the same projector row with the same response.
 pub(super) struct LitClass {
+    /// Ascending.
     pub columns: Vec<usize>,
-    pub own_row: i64,
-    /// What the light of each projector row counts for, `[projector rows]`.
-    pub weights: Array1<f64>,
+    own_row: i64,
+    /// By which the weights are spread; `None` if they are as they are to be used.
+    shares: Option<Shares>,
+    weights: Arc<Array1<f64>>,
 }
 
 impl LitClass {
     /// What the light of relative row `u` counts for.
     pub fn weight(&self, u: i32) -> f64 {
-        usize::try_from(self.own_row + i64::from(u))
-            .ok()
-            .and_then(|v| self.weights.get(v))
-            .copied()
-            .unwrap_or(0.0)
+        let v = self.own_row + i64::from(u);
+        match &self.shares {
+            Some(shares) => collected(self.weights.view(), shares, v),
+            None => usize::try_from(v).ok().and_then(|v| self.weights.get(v)).copied().unwrap_or(0.0),
+        }
+    }
+
+    /// Puts the light of its pixels into a row of the image. `profiles`, `[reach, columns]`, begin at `u_min`.
+    fn relight(&self, mut image_row: ArrayViewMut1<f32>, profiles: ArrayView2<f32>, u_min: i32) {
+        // In f64, because the light of thousands of dim rows adds up next to a bright one.
+        let mut sums = vec![0.0_f64; self.columns.len()];
+        for (u, light) in (u_min..).zip(profiles.outer_iter()) {
+            let weight = self.weight(u);
+            if weight != 0.0 {
+                let of_pixels = sums.iter_mut().zip(&self.columns);
+                of_pixels.for_each(|(sum, &column)| *sum += weight * f64::from(light[column]));
+            }
+        }
+        self.columns.iter().zip(sums).for_each(|(&column, sum)| image_row[column] = sum as f32);
     }
 }
 
@@ -115,48 +125,26 @@ impl<'a> LitRows<'a> {
             }
             RelitBeam::AsLit | RelitBeam::Ideal => weights.to_owned(),
         };
-        Ok(Self { timing, columns, weights, beam })
+        Ok(Self { timing, columns, weights: Arc::new(weights), beam })
     }
 
     /// The classes of camera row `t`.
     pub fn classes(&self, t: usize) -> Vec<LitClass> {
         let weights = || self.weights.clone();
         let Some(response) = self.timing.response() else {
-            let own_row = self.timing.camera().own_row(t) as i64;
-            return vec![LitClass { columns: (0..self.columns).collect(), own_row, weights: weights() }];
+            let (columns, own_row) = ((0..self.columns).collect(), self.timing.camera().own_row(t) as i64);
+            return vec![LitClass { columns, own_row, shares: None, weights: weights() }];
         };
         let classes = response.classes(t, 0..self.columns, PLACE_STEPS).into_iter();
         classes
             .map(|class| LitClass {
-                weights: match self.beam {
-                    RelitBeam::AsLit => {
-                        collected_rows(self.weights.view(), &class.shares, 0, self.weights.len())
-                    }
-                    RelitBeam::Ideal => weights(),
-                },
-                own_row: class.own_row,
                 columns: class.columns,
+                own_row: class.own_row,
+                shares: (self.beam == RelitBeam::AsLit).then_some(class.shares),
+                weights: weights(),
             })
             .collect()
     }
-}
-
-/// Relights pixels whose profiles, `[reach, pixels]`, begin at projector row `first_v`.
-fn relight_row(
-    mut relit: ArrayViewMut1<f32>,
-    profiles: ArrayView2<f32>,
-    first_v: i64,
-    weights: ArrayView1<f64>,
-) {
-    // In f64, because the light of thousands of dim rows adds up next to a bright one.
-    let mut sum = Array1::<f64>::zeros(relit.len());
-    for (v, light) in (first_v..).zip(profiles.outer_iter()) {
-        let weight = usize::try_from(v).ok().and_then(|v| weights.get(v)).copied().unwrap_or(0.0);
-        if weight != 0.0 {
-            sum.zip_mut_with(&light, |sum, &light| *sum += weight * f64::from(light));
-        }
-    }
-    relit.zip_mut_with(&sum, |pixel, &sum| *pixel = sum as f32);
 }
 
 #[cfg(test)]

@@ -92,8 +92,8 @@ impl Uncertainty<'_> {
         self.of_sums_in_rows(0, transport, samples, &LightSums::Bands(bands))
     }
 
-    /// Standard deviation of sums of the light, `[sums, t, s]`, in the units of the transport. `transport` and `samples`
-    /// contain only the camera rows starting at `first_row`.
+    /// Standard deviation of sums of the light, `[sums, t, s]`, in the units of the transport. `transport` and
+    /// `samples` contain only the camera rows starting at `first_row`.
     ///
     /// # Errors
     /// Those of [`Self::of_bands`]; [`PlaneError::Rows`] for rows that do not exist in the camera.
@@ -126,10 +126,10 @@ impl Uncertainty<'_> {
 
     /// Size of the bias that the prior gives to each sum, `[sums, t, s]`.
     ///
-    /// Without noise, the estimate of a sum differs from the truth by `alpha (D g)'(D T) + beta/2 sum(g)`, where `g =
-    /// H_FF^-1 e` for the sum's weights `e`, and `T` the truth. Here the estimate is taken for the truth, and the terms of
-    /// the sum by their sizes, so that terms that cancel by chance do not hide the others. Where the truth is rougher
-    /// than the estimate shows, the bias may be larger.
+    /// Without noise, the estimate of a sum differs from the truth by `alpha (D g)'(D T) + beta/2 sum(g)`, where
+    /// `g = H_FF^-1 e` for the sum's weights `e`, and `T` the truth. Here the estimate is taken for the truth, and the
+    /// terms of the sum by their sizes, so that terms that cancel by chance do not hide the others. Where the truth is
+    /// rougher than the estimate shows, the bias may be larger.
     ///
     /// # Errors
     /// Those of [`Self::of_sums_in_rows`].
@@ -202,8 +202,8 @@ impl Uncertainty<'_> {
         Ok(out)
     }
 
-    /// Variance of each band of each pixel of a tile in camera row `t` through errors of the calibration,
-    /// `[pixels * bands]`.
+    /// Variance of each sum of each pixel of a tile in camera row `t` through errors of the calibration,
+    /// `[pixels * sums]`.
     fn systematic(
         &self,
         t: usize,
@@ -290,14 +290,19 @@ impl<'a> Sums<'a> {
         }
     }
 
-    /// What the light of relative row `u` of a pixel, its camera row counted from the first one, counts for.
-    fn weight(&self, index: usize, (t, column): (usize, usize), u: i32) -> f64 {
+    /// The class of a pixel, its camera row counted from the first one; `None` if its weights do not depend on it.
+    fn class(&self, t: usize, column: usize) -> Option<&LitClass> {
+        match self {
+            Self::Bands(_) => None,
+            Self::Relit(rows) => rows[t].iter().find(|class| class.columns.binary_search(&column).is_ok()),
+        }
+    }
+
+    /// What the light of relative row `u` of a pixel of this class counts for.
+    fn weight(&self, index: usize, class: Option<&LitClass>, u: i32) -> f64 {
         match self {
             Self::Bands(bands) => f64::from(u8::from(bands[index].iter().any(|range| range.contains(&u)))),
-            Self::Relit(rows) => rows[t]
-                .iter()
-                .find(|class| class.columns.binary_search(&column).is_ok())
-                .map_or(0.0, |class| class.weight(u)),
+            Self::Relit(_) => class.map_or(0.0, |class| class.weight(u)),
         }
     }
 }
@@ -308,7 +313,7 @@ struct Data<'a> {
     t: usize,
     /// The row's part of the transport, `[reach, columns]`.
     profiles: ArrayView2<'a, f32>,
-    /// The result, `[bands, columns]`.
+    /// The result, `[sums, columns]`.
     out: ArrayViewMut2<'a, f32>,
 }
 
@@ -329,8 +334,9 @@ impl Problem<'_> {
         let of_pixels = linear.axis_chunks_iter_mut(Axis(0), sums.len());
         let of_pixels = of_pixels.zip(free.axis_chunks_iter_mut(Axis(0), sums.len()));
         for ((mut linear, mut free), &(at, column)) in of_pixels.zip(&tile.pixels) {
+            let class = sums.class(rows[at].data.t, column);
             for (index, row) in linear.rows_mut().into_iter().enumerate() {
-                self.put_weights(row, |u| sums.weight(index, (rows[at].data.t, column), u));
+                self.put_weights(row, |u| sums.weight(index, class, u));
             }
             let lit = self.lit(&places, rows[at].data.profiles.column(column));
             free.rows_mut().into_iter().for_each(|mut free| free.assign(&lit));
@@ -342,7 +348,8 @@ impl Problem<'_> {
         }
     }
 
-    /// The weight of each unknown in a sum in which the light of relative row `u` has the weight `weight(u)`, `[slots]`.
+    /// The weight of each unknown, `[slots]`, in a sum in which the light of relative row `u` has the weight
+    /// `weight(u)`.
     fn put_weights(&self, mut of_slots: ArrayViewMut1<f64>, weight: impl Fn(i32) -> f64) {
         for (of_slot, slot) in of_slots.iter_mut().zip(&self.model.slots) {
             *of_slot = if slot.kind == SlotKind::Own { weight(slot.u) } else { 0.0 };
