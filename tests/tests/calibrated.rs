@@ -14,7 +14,8 @@ use rand_xoshiro::rand_core::SeedableRng;
 use raysweep::rig::Rig;
 use raysweep_core::{Counts, SettingsId};
 use raysweep_pipeline::{
-    DemuxFold, DemuxOptions, FilmSolver, Point, PointRole, Schedule, Solved, Spot, SweepGeometry, Unit,
+    DemuxFold, DemuxOptions, FilmSolver, Point, PointRole, Schedule, Solved, Spot, SpotScan, SweepGeometry,
+    Unit,
 };
 use raysweep_sim::PlaneRig;
 use raysweep_tests::{data, rig_text};
@@ -324,6 +325,35 @@ fn a_strip_of_the_board_shows_how_late_each_image_is() {
     let scene = lateness(&gauge_of(60..68).unwrap(), 300.0, 600.0, 0.0);
     assert!(scene.chi2_per_sample > 9.0, "{scene:?}");
     assert!(gauge_of(120..130).is_err() && gauge_of(5..5).is_err());
+}
+
+#[test]
+fn a_frame_that_comes_to_lie_on_the_direct_row_is_left_out_of_its_cycle() {
+    let studio = Studio::new();
+    let geometry = SweepGeometry { spot: Spot::Flying(SpotScan::Unknown), ..studio.stated.clone() };
+    let schedule = film_schedule();
+    let mut solver = FilmSolver::new(DemuxOptions::default(), &schedule, &geometry).unwrap();
+    let mut noise = Xoshiro256PlusPlus::seed_from_u64(3);
+    let dark = studio.dark();
+    let mut cycle = || -> Vec<(Setting, Arc<Array2<f32>>)> {
+        let take = |point: &Point| {
+            let (delay_us, image) = studio.take(&geometry, point, 1, &mut noise);
+            (Setting::new(delay_us, point.exposure_us), Arc::new(image))
+        };
+        schedule.points[1..].iter().map(take).collect()
+    };
+    let learned = (0..4).find_map(|_| solver.learn(&cycle(), &dark).map(|found| found.is_ok()));
+    assert_eq!(learned, Some(true));
+    let frames = cycle();
+    let solve = |delay_us: f64, factor: f32| {
+        let mut frames = frames.clone();
+        let (setting, image) = &mut frames[11];
+        (setting.delays_us, *image) = (vec![delay_us], Arc::new(image.mapv(|counts| factor * counts)));
+        solver.solve(&frames, &dark, &|| true).unwrap().t
+    };
+    // An exposure of 600 us begins on the direct row at a delay of 300 us, and 420 us is far from it.
+    assert!(solve(300.0, 1.0) == solve(300.0, 0.5), "the image is used");
+    assert!(solve(420.0, 1.0) != solve(420.0, 0.5), "the image is not used");
 }
 
 #[test]

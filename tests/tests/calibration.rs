@@ -182,6 +182,10 @@ fn an_interrupted_calibration_is_resumed_to_the_same_bits() {
         let resumed = bench.resume(&whole.session);
         assert_eq!(resumed.state, "complete", "after line {end}: {:?}", resumed.error);
         assert!(fs::read(whole.session.join("calibration.npz")).unwrap() == arrays, "after line {end}");
+        // Where no run has taken eight black pictures of both exposures, the report says so.
+        let page = fs::read_to_string(whole.session.join("report.html")).unwrap();
+        let is_unseen = [black + 9, black + 20].contains(&end);
+        assert_eq!(page.contains("flickers was not looked for"), is_unseen, "after line {end}");
         let again = kept(&whole.session).header;
         assert_eq!((again.light, again.timing), (header.light.clone(), header.timing.clone()));
     }

@@ -213,21 +213,10 @@ impl DemuxFold {
             settings.push(sample.setting.earlier(late_us.get(&role).copied().unwrap_or(0.0)));
         }
         Ok(SweepStack {
-            timing: self.timing.clone(),
-            prior: self.options.prior(),
             exposures_us,
-            settings,
             dark_frames,
-            calibration: None,
-            images,
             valid,
-            regular: None,
-            regular_valid: None,
-            filled: None,
-            noise: None,
-            variance_ratio: None,
-            u0_rows: None,
-            one_band: false,
+            ..SweepStack::new(self.timing.clone(), self.options.prior(), settings, images)
         })
     }
 

@@ -133,8 +133,8 @@ pub struct FilmSolver {
     dark_frames: usize,
     /// The film's first cycles; `None` after it has learned from them.
     first: Option<FirstCycles>,
-    /// What they showed; `None` before.
-    choices: Option<Choices>,
+    /// What the plan says, and then what they showed.
+    choices: Choices,
     /// The strip of the board that shows each frame's jitter, if it is in view.
     strip: Option<StripGauge>,
 }
@@ -163,13 +163,13 @@ impl FilmSolver {
         let dark = schedule.points.iter().find(|point| matches!(point.role, PointRole::Dark(_)));
         Ok(Self {
             options,
+            choices: Choices::planned(demux.clone(), geometry),
             demux,
             geometry: geometry.clone(),
             scale: geometry.scale_of(&rows),
             measured: geometry.white_of(&rows).mapv(f64::is_finite),
             dark_frames: dark.map_or(1, |dark| dark.frames as usize),
             first: Some(FirstCycles::default()),
-            choices: None,
             strip: StripGauge::of(geometry).map_err(invalid)?,
         })
     }
@@ -197,15 +197,7 @@ impl FilmSolver {
         go_on: &(dyn Fn() -> bool + Sync),
     ) -> Result<Transport, NotSolved> {
         let mut stack = self.stack(frames, dark);
-        let planned;
-        let choices = match &self.choices {
-            Some(choices) => choices,
-            None => {
-                planned = Choices::planned(&self.demux, &self.geometry, &stack).map_err(not_solved)?;
-                &planned
-            }
-        };
-        choices.solve(0..self.geometry.height, 0, &mut stack, go_on).map_err(not_solved)
+        self.choices.solve(0..self.geometry.height, 0, &mut stack, go_on).map_err(not_solved)
     }
 
     /// Takes the frames of another complete cycle, as for [`Self::solve`]. Once it has the first few, it chooses from
@@ -229,7 +221,10 @@ impl FilmSolver {
         mean.images /= first.cycles as f32;
         let rows = rows_to_choose_by(self.geometry.height);
         Some(match choose(&self.demux, &self.options, &self.geometry, &rows, mean.of_rows(&rows)) {
-            Ok(choices) => Ok(&self.choices.insert(choices).findings),
+            Ok(choices) => {
+                self.choices = choices;
+                Ok(&self.choices.findings)
+            }
             Err(error) => Err(not_solved(error)),
         })
     }
@@ -257,22 +252,13 @@ impl FilmSolver {
             });
             setting.earlier(late_us.unwrap_or(0.0))
         };
+        let exposures_us = frames.iter().map(|(setting, _)| setting.exposure_us).collect();
+        let settings: Vec<Setting> = frames.iter().map(setting).collect();
         SweepStack {
-            timing: self.demux.timing().clone(),
-            prior: self.demux.prior(),
-            exposures_us: frames.iter().map(|(setting, _)| setting.exposure_us).collect(),
-            settings: frames.iter().map(setting).collect(),
+            exposures_us,
             dark_frames: vec![self.dark_frames; frames.len()],
-            calibration: None,
-            images,
             valid,
-            regular: None,
-            regular_valid: None,
-            filled: None,
-            noise: None,
-            variance_ratio: None,
-            u0_rows: None,
-            one_band: false,
+            ..SweepStack::new(self.demux.timing().clone(), self.demux.prior(), settings, images)
         }
     }
 }

@@ -51,12 +51,9 @@ pub struct Findings {
 /// How a sweep is to be demultiplexed, and why. The choice is based on a few camera rows, so that a sweep solved in
 /// parts gives the same result as one solved as a whole.
 pub struct Choices {
-    /// Solves the images in use.
+    /// Solves the images; without a flying spot, which is added for those that it cuts.
     demux: Demux,
-    /// Indices of the images in use.
-    kept: Vec<usize>,
-    /// Which of these images may be coupled.
-    steady: Vec<usize>,
+    geometry: SweepGeometry,
     /// By how much later than modelled light arrives.
     late_us: f64,
     /// What is not known of the calibration, after the run has refined it.
@@ -89,22 +86,15 @@ pub fn choose(
     mut stack: SweepStack,
 ) -> Result<Choices, PlaneError> {
     let mut findings = Findings::planned(planned.prior(), geometry);
-    let all: Vec<usize> = (0..stack.settings.len()).collect();
-    let settings = stack.settings.clone();
     let cut = SpotCut::of(geometry, &stack.timing, &stack.settings)?;
     findings.add_spot(geometry.spot, &cut, &stack.settings);
-    let (cut, spot) = match cut {
-        SpotCut::Nowhere | SpotCut::Everywhere => (Vec::new(), None),
-        SpotCut::LeftOut { cut } => (cut, None),
-        SpotCut::Modelled { cut, spot } => (cut, Some(spot)),
-    };
-    stack.keep(|n| !cut.contains(&n));
+    let settings = stack.settings.clone();
+    stack.keep(|n| cut.is_steady(n));
     let calibration = geometry.calibration.as_ref().map(|calibration| {
         let late_sd_us = findings.check_calibration(&mut stack, rows);
         late_sd_us.map_or(calibration.covariance, |sd_us| calibration.covariance.with_latency_sd(sd_us))
     });
     let late_us = findings.late_us.unwrap_or(0.0);
-    let uncut: Vec<usize> = all.iter().copied().filter(|n| !cut.contains(n)).collect();
     let planned = planned.with_settings(stack.settings.clone())?;
     let sample_of = |images: &Array3<f32>| {
         let valid = stack.valid.as_ref().map(|valid| valid.view());
@@ -151,17 +141,10 @@ pub fn choose(
             }
         }
     };
-    Ok(match spot {
-        // Neighbours see the spot at other times, so images that depend on it are not coupled.
-        Some(spot) => {
-            let demux = demux.with_settings(settings)?.with_spot(spot)?;
-            Choices { demux, kept: all, steady: uncut, late_us, calibration, noise, coupling, findings }
-        }
-        None => {
-            let steady = (0..uncut.len()).collect();
-            Choices { demux, kept: uncut, steady, late_us, calibration, noise, coupling, findings }
-        }
-    })
+    // A spot that cannot be modelled is told here.
+    cut.modelled_by(demux.with_settings(settings)?)?;
+    let geometry = geometry.clone();
+    Ok(Choices { demux, geometry, late_us, calibration, noise, coupling, findings })
 }
 
 impl Findings {
@@ -228,28 +211,17 @@ impl Findings {
 }
 
 impl Choices {
-    /// What rig file and plan say, for images with the settings of `stack`, whose light is not looked at.
-    ///
-    /// # Errors
-    /// If they do not give a valid model.
-    pub(crate) fn planned(
-        planned: &Demux,
-        geometry: &SweepGeometry,
-        stack: &SweepStack,
-    ) -> Result<Self, PlaneError> {
-        let cut = SpotCut::of(geometry, &stack.timing, &stack.settings)?;
-        let kept: Vec<usize> = (0..stack.settings.len()).filter(|&n| cut.keeps(n)).collect();
-        let settings = kept.iter().map(|&n| stack.settings[n].clone()).collect();
-        Ok(Self {
-            demux: cut.modelled_by(planned.with_settings(settings)?)?,
-            kept,
-            steady: Vec::new(),
+    /// What rig file and plan say, before any image is looked at.
+    pub(crate) fn planned(demux: Demux, geometry: &SweepGeometry) -> Self {
+        Self {
+            findings: Findings::planned(demux.prior(), geometry),
+            demux,
+            geometry: geometry.clone(),
             late_us: 0.0,
             calibration: None,
             noise: None,
             coupling: None,
-            findings: Findings::planned(planned.prior(), geometry),
-        })
+        }
     }
 
     /// The same with an image under less light for pixels that saturate, whose level is found from the rows of
@@ -263,10 +235,12 @@ impl Choices {
         rows: &[usize],
         mut stack: SweepStack,
     ) -> Result<Self, PlaneError> {
-        stack.keep(|n| self.kept.contains(&n));
+        let cut = SpotCut::of(&self.geometry, &stack.timing, &stack.settings)?;
+        stack.keep(|n| cut.keeps(n));
         stack.settings.iter_mut().for_each(|setting| *setting = setting.earlier(self.late_us));
         image.setting = image.setting.earlier(self.late_us);
-        let said = match image.levelled(&self.demux, rows, &stack)? {
+        let demux = cut.modelled_by(self.demux.clone())?;
+        let said = match image.levelled(&demux, rows, &stack)? {
             Some(bracket) => {
                 let said = format!(
                     "taken under {:.2} % of the sweep's light, as found from both",
@@ -303,9 +277,12 @@ impl Choices {
         stack: &mut SweepStack,
         go_on: &(dyn Fn() -> bool + Sync),
     ) -> Result<Transport, PlaneError> {
-        if self.kept.len() < stack.settings.len() {
-            stack.keep(|n| self.kept.contains(&n));
-        }
+        let cut = SpotCut::of(&self.geometry, &stack.timing, &stack.settings)?;
+        let kept = (0..stack.settings.len()).filter(|&n| cut.keeps(n));
+        // Neighbours see a spot at other times, so images that depend on it are not coupled.
+        let steady: Vec<usize> =
+            kept.enumerate().filter(|&(_, n)| cut.is_steady(n)).map(|(place, _)| place).collect();
+        stack.keep(|n| cut.keeps(n));
         stack.settings.iter_mut().for_each(|setting| *setting = setting.earlier(self.late_us));
         let inner = rows.start - held_from..rows.end - held_from;
         let mut coupled = None;
@@ -313,14 +290,14 @@ impl Choices {
             return Err(PlaneError::Stopped);
         }
         if let Some((noise, coupling)) = self.noise.zip(self.coupling) {
-            let Coupled { stack: images, variance_ratio } = if self.steady.len() == stack.settings.len() {
+            let Coupled { stack: images, variance_ratio } = if steady.len() == stack.settings.len() {
                 couple(&coupling, &noise, stack)?
             } else {
-                let mut steady = stack.clone();
-                steady.keep(|n| self.steady.contains(&n));
-                let mut coupled = couple(&coupling, &noise, &steady)?;
+                let mut of_steady = stack.clone();
+                of_steady.keep(|n| steady.contains(&n));
+                let mut coupled = couple(&coupling, &noise, &of_steady)?;
                 let mut all = stack.images.clone();
-                for (&n, image) in self.steady.iter().zip(coupled.stack.outer_iter()) {
+                for (&n, image) in steady.iter().zip(coupled.stack.outer_iter()) {
                     all.index_axis_mut(Axis(0), n).assign(&image);
                 }
                 coupled.stack = all;
@@ -342,7 +319,8 @@ impl Choices {
         let images = coupled.as_ref().unwrap_or(&stack.images);
         let valid = stack.valid.as_ref().map(|valid| valid.view());
         let rows: Vec<usize> = rows.collect();
-        self.demux.with_settings(stack.settings.clone())?.solve_rows(&rows, images.view(), valid, go_on)
+        let demux = cut.modelled_by(self.demux.with_settings(stack.settings.clone())?)?;
+        demux.solve_rows(&rows, images.view(), valid, go_on)
     }
 }
 

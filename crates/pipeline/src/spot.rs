@@ -56,6 +56,14 @@ impl SpotCut {
         }
     }
 
+    /// Whether it does not matter for an image when the spot passes a pixel.
+    pub fn is_steady(&self, image: usize) -> bool {
+        match self {
+            Self::LeftOut { cut } | Self::Modelled { cut, .. } => !cut.contains(&image),
+            Self::Nowhere | Self::Everywhere => true,
+        }
+    }
+
     /// The demultiplexer of the images that are used, with the spot where it is modelled.
     ///
     /// # Errors

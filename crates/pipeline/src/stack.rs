@@ -42,17 +42,17 @@ pub struct SweepStack {
 }
 
 impl SweepStack {
-    /// A stack with only these camera rows.
-    pub(crate) fn of_rows(&self, rows: &[usize]) -> Self {
+    /// Images with these settings, of which nothing else is known: exposures as planned, dark images of one frame.
+    pub(crate) fn new(timing: RowTiming, prior: Prior, settings: Vec<Setting>, images: Array3<f32>) -> Self {
         Self {
-            timing: self.timing.clone(),
-            prior: self.prior,
-            exposures_us: self.exposures_us.clone(),
-            settings: self.settings.clone(),
-            dark_frames: self.dark_frames.clone(),
+            timing,
+            prior,
+            exposures_us: settings.iter().map(|setting| setting.exposure_us).collect(),
+            dark_frames: vec![1; settings.len()],
+            settings,
             calibration: None,
-            images: self.images.select(Axis(1), rows),
-            valid: self.valid.as_ref().map(|valid| valid.select(Axis(1), rows)),
+            images,
+            valid: None,
             regular: None,
             regular_valid: None,
             filled: None,
@@ -60,6 +60,17 @@ impl SweepStack {
             variance_ratio: None,
             u0_rows: None,
             one_band: false,
+        }
+    }
+
+    /// A stack with only these camera rows.
+    pub(crate) fn of_rows(&self, rows: &[usize]) -> Self {
+        let images = self.images.select(Axis(1), rows);
+        Self {
+            exposures_us: self.exposures_us.clone(),
+            dark_frames: self.dark_frames.clone(),
+            valid: self.valid.as_ref().map(|valid| valid.select(Axis(1), rows)),
+            ..Self::new(self.timing.clone(), self.prior, self.settings.clone(), images)
         }
     }
 
@@ -78,6 +89,9 @@ impl SweepStack {
     /// Keeps the images for whose index `kept` returns true.
     pub(crate) fn keep(&mut self, kept: impl Fn(usize) -> bool) {
         let kept: Vec<usize> = (0..self.settings.len()).filter(|&n| kept(n)).collect();
+        if kept.len() == self.settings.len() {
+            return;
+        }
         self.exposures_us = kept.iter().map(|&n| self.exposures_us[n]).collect();
         self.dark_frames = kept.iter().map(|&n| self.dark_frames[n]).collect();
         self.settings = kept.iter().map(|&n| self.settings[n].clone()).collect();

@@ -72,22 +72,10 @@ fn stack() -> SweepStack {
     let seen = |setting| predict(&whole, all.view(), setting).unwrap().slice_move(s![2..8, ..]);
     let images: Vec<_> = settings.iter().map(seen).collect();
     let views: Vec<_> = images.iter().map(|image| image.view()).collect();
+    let images = ndarray::stack(Axis(0), &views).unwrap();
     SweepStack {
-        timing: timing(),
-        prior: Prior::SPLIT,
         exposures_us: points.iter().map(|point| point.exposure_us).collect(),
-        dark_frames: vec![1; settings.len()],
-        calibration: None,
-        settings,
-        images: ndarray::stack(Axis(0), &views).unwrap(),
-        valid: None,
-        regular: None,
-        regular_valid: None,
-        filled: None,
-        noise: None,
-        variance_ratio: None,
-        u0_rows: None,
-        one_band: false,
+        ..SweepStack::new(timing(), Prior::SPLIT, settings, images)
     }
 }
 

@@ -219,8 +219,9 @@ pub struct BoardPixels {
     pub curve: MeasuredCurve,
     /// White, as all light in counts that are proportional to it.
     pub white: WhiteMap,
-    /// The room's light, and the run whose clock its flicker has; `None` if too few of its frames have time stamps.
-    pub ambient: Option<(Ambient, u32)>,
+    /// The room's light, and the run whose clock its flicker has, or none if it was not looked for; `None` if too few
+    /// of its frames have time stamps.
+    pub ambient: Option<(Ambient, Option<u32>)>,
     /// The places of single pixels against a smooth map.
     pub places: RowPlaces,
     /// Place and response.
@@ -302,7 +303,7 @@ impl BoardPixels {
         if ambient.level_of_white(self.white.level_dn.value, geometry.raster.row_time_us) < DARK_ROOM {
             return None;
         }
-        let start = entry.exposed.as_ref().filter(|exposed| exposed.run == *run);
+        let start = entry.exposed.as_ref().filter(|exposed| Some(exposed.run) == *run);
         let opened_s = start.and_then(|exposed| exposed.starts_ns.first()).map(|&start| start as f64 * 1e-9);
         let row_time_us = match images.task.shutter(purpose) {
             Shutter::Rolling => geometry.camera_row_time_us,
@@ -394,7 +395,7 @@ fn room(
     dark: &DarkFit,
     curve: &MeasuredCurve,
     noise: SensorNoise,
-) -> Result<Option<(Ambient, u32)>, CalibrationError> {
+) -> Result<Option<(Ambient, Option<u32>)>, CalibrationError> {
     let Some(run) = images.run_of_ambient() else { return Ok(None) };
     let exposures = [(BoardPurpose::Black, WHOLE_US), (BoardPurpose::Ambient, AMBIENT_US)];
     let taken = |run: Option<u32>| {
@@ -405,6 +406,7 @@ fn room(
         });
         Ok::<_, CalibrationError>([black?, short?])
     };
+    let mut looked = None;
     // Dropped before all frames are read.
     if let of_run = taken(Some(run))?
         && has_enough(&of_run)
@@ -413,13 +415,14 @@ fn room(
         let geometry = &images.task.task.geometry;
         let (row_time_us, rate_hz) = (geometry.camera_row_time_us, 1e6 / geometry.raster.period_us);
         let found = ambient(&black_frames(&of_run), row_time_us, rate_hz, noise, Some(usable.view()))?;
+        looked = Some(run);
         if found.flicker.is_some() {
-            return Ok(Some((found, run)));
+            return Ok(Some((found, looked)));
         }
     }
     let of_all = taken(None)?;
     match has_enough(&of_all) {
-        true => Ok(Some((steady(&black_frames(&of_all), noise)?, run))),
+        true => Ok(Some((steady(&black_frames(&of_all), noise)?, looked))),
         false => Ok(None),
     }
 }

@@ -53,11 +53,14 @@ impl BoardFindings {
         let RowTimes { latency_sd_us, useful_frames, .. } = self.times;
         let latency = (latency_sd_us > MOST_LATENCY_SD_US).then(|| {
             format!(
-                "{useful_frames} useful frames: the latency is known to {latency_sd_us:.2} us only; sweeps find the rest from their own light, films do not: raise calibration.delays"
+                "{useful_frames} useful frames: the latency is known to {latency_sd_us:.2} us only; sweeps, and films of five cycles or more, find the rest from their own light: raise calibration.delays"
             )
         });
         let curve = self.pixels.curve.warning().map(str::to_owned);
-        latency.into_iter().chain(curve).collect()
+        let unseen = matches!(self.pixels.ambient, Some((_, None))).then(|| {
+            "whether the room's light flickers was not looked for, because the calibration was interrupted among its black pictures; if lamps are on, calibrate again".to_owned()
+        });
+        latency.into_iter().chain(curve).chain(unseen).collect()
     }
 
     /// The calibration, in the form in which it is kept.
