@@ -2,7 +2,6 @@
 
 pub mod apt;
 mod elf;
-mod libclang;
 mod list;
 mod probe;
 

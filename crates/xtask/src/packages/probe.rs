@@ -6,7 +6,7 @@ use std::io::{ErrorKind, Write};
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-use super::{elf, libclang};
+use super::elf;
 use crate::run::{Done, program, target};
 
 /// A requirement that a package fulfils.
@@ -88,7 +88,7 @@ impl Probe {
                 "",
             ),
             Self::PkgConfig(library) => pkg_config(library.as_deref()),
-            Self::Libclang => libclang::check(),
+            Self::Libclang => libclang(),
         }
     }
 }
@@ -223,6 +223,20 @@ fn program_headers(bytes: &[u8]) -> Option<Vec<u32>> {
     // From the file header: offset, entry size and number of the program headers.
     let (start, size, count) = (u32_at(32)? as usize, u16_at(54)? as usize, u16_at(56)? as usize);
     (0..count).map(|index| u32_at(start + index * size)).collect()
+}
+
+/// Loads libclang through the crate by which bindgen does, so that both find the same file.
+fn libclang() -> Done {
+    if let Some(place) = std::env::var_os("LIBCLANG_PATH")
+        && !Path::new(&place).is_absolute()
+    {
+        let why = "must be an absolute path: build scripts, which search there, run in other folders";
+        return Err(format!("LIBCLANG_PATH={}: {why}", place.display()));
+    }
+    // It panics if `llvm-config --prefix` prints nothing.
+    std::panic::catch_unwind(clang_sys::load_manually)
+        .unwrap_or_else(|_| Err("the crate clang-sys panics while it searches".to_owned()))
+        .map(|_| ())
 }
 
 /// Compiles and links an empty program.
