@@ -230,7 +230,7 @@ fn cancel() {
     lab.assert_parked("cancel", since_ns);
     assert_eq!(lab.ended().0, RunState::Idle);
     let status = lab.client().status().unwrap().mirror.unwrap();
-    assert!(!status.laser && status.parked, "{status:?}");
+    assert!(!status.laser && status.parked, "{status:?}\n{}", lab.log());
 }
 
 #[test]
@@ -242,7 +242,8 @@ fn interlock() {
     lab.assert_parked("interlock opened", since_ns);
     let (state, error) = lab.ended();
     assert_eq!(state, RunState::Faulted);
-    assert!(error.unwrap().contains("interlock"));
+    let error = error.unwrap();
+    assert!(error.contains("interlock"), "{error}");
     let status = lab.client().status().unwrap().mirror.unwrap();
     assert_eq!((status.light.as_str(), status.parked), ("interlock_open", true));
 }
@@ -380,7 +381,8 @@ fn viewfinder() {
     lab.assert_parked("viewfinder, interlock opened", since_ns);
     let (state, error) = lab.ended();
     assert_eq!(state, RunState::Faulted);
-    assert!(error.unwrap().contains("interlock"));
+    let error = error.unwrap();
+    assert!(error.contains("interlock"), "{error}");
     // It gets no light either if it begins like this.
     let lit = lab.lit();
     lab.client().run(&RunParams { plan: plan(), ..RunParams::default() }).unwrap();

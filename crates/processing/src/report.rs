@@ -20,6 +20,11 @@ pub(crate) fn named<const N: usize>(facts: [(&str, String); N]) -> Vec<(String, 
     facts.map(|(name, fact)| (name.to_owned(), fact)).to_vec()
 }
 
+/// Something found in the data, and about what.
+pub(crate) fn remark(what: &str, said: &str) -> Block {
+    Block::Note(NoteLevel::Info, format!("{what}: {said}"))
+}
+
 /// Date, operator, sample, tags, note and folder of a session.
 fn subtitle(state: &State, session: &Session) -> String {
     let entry = &state.session;
@@ -37,19 +42,17 @@ fn subtitle(state: &State, session: &Session) -> String {
 /// Frame counts, and statistics of the VSYNC line.
 pub(crate) fn accounts(state: &State) -> Vec<Block> {
     let counts = &state.counts;
+    let row =
+        |name: &str, count: u64, means: &str| vec![name.to_owned(), count.to_string(), means.to_owned()];
     let mut rows = vec![
-        vec!["expected triggers".to_owned(), counts.expected.to_string()],
-        vec!["averaged".into(), counts.averaged.to_string()],
-        vec!["settling".into(), counts.settling.to_string()],
-        vec!["cancelled".into(), counts.cancelled.to_string()],
+        row("expected triggers", counts.expected, "frames that the camera should have sent"),
+        row("averaged", counts.averaged, "in the stored images, black pictures and whole periods included"),
+        row("settling", counts.settling, "perhaps taken with the settings before"),
+        row("cancelled", counts.cancelled, "not needed: between passes, or around a pause or an end"),
     ];
-    for (cause, frames) in &counts.lost {
-        let cause = serde_json::to_value(cause)
-            .ok()
-            .and_then(|value| value.as_str().map(|name| name.replace('_', " ")));
-        rows.push(vec![format!("lost: {}", cause.unwrap_or_default()), frames.to_string()]);
-    }
-    let mut blocks = vec![Block::Table(Table { headers: vec!["frames".into(), "count".into()], rows })];
+    rows.extend(counts.lost.iter().map(|(cause, &frames)| row(&format!("lost: {cause}"), frames, "")));
+    let mut blocks =
+        vec![Block::Table(Table { headers: ["frames", "count", ""].map(str::to_owned).to_vec(), rows })];
     if !counts.balanced() {
         blocks.push(Block::Note(
             NoteLevel::Error,
@@ -79,7 +82,7 @@ pub(crate) fn accounts(state: &State) -> Vec<Block> {
         let allan = vsync.allan_1s.map(|allan| ("Allan deviation over 1 s", format!("{allan:.1e}")));
         let facts = [
             ("VSYNC period", format!("{:.3} µs", vsync.period_us)),
-            ("edge jitter (sigma)", format!("{:.2} µs", vsync.jitter_us)),
+            ("jitter of an edge (standard deviation)", format!("{:.2} µs", vsync.jitter_us)),
             ("99 % of the edges within", format!("{:.1} µs", vsync.jitter_p99_us)),
             (
                 "edges seen / missed / false",

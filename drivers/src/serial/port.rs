@@ -9,6 +9,7 @@ use nix::errno::Errno;
 use raysweep_core::{DeviceError, DeviceErrorKind};
 use serialport::{DataBits, FlowControl, Parity, SerialPort, StopBits, TTYPort};
 
+use super::patience::Patience;
 use super::wire::{Parsed, Receiver};
 
 /// Maximum time for the port to accept bytes in one call: a feeding loop must return to reading.
@@ -142,10 +143,9 @@ impl Port {
         parse: impl Fn(&[u8]) -> Parsed<R>,
         mut pick: impl FnMut(R) -> Option<T>,
     ) -> Result<Option<T>, DeviceError> {
-        let deadline = Instant::now() + timeout;
+        let mut patience = Patience::new(timeout, Instant::now());
         loop {
-            // Evaluated first: a reply that arrived while this thread did not run is not late.
-            let is_over = Instant::now() >= deadline;
+            let is_over = patience.is_over(Instant::now());
             while let Some(reply) = self.reply(&parse)? {
                 if let Some(picked) = pick(reply) {
                     return Ok(Some(picked));

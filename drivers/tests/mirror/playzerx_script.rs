@@ -1,6 +1,7 @@
 //! A PlayzerX's stream, frame by frame as documented by the maker, with a simple model of the FIFO: streaming, the
 //! count of samples left, parking, health. Uses no encoding code of the driver or the simulator.
 
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -45,6 +46,8 @@ struct Desk {
     most_held: u64,
     /// Sent before each answer.
     noise: &'static [u8],
+    /// Pause before it processes the next padding.
+    pause: Option<Duration>,
     /// How it goes on once its FIFO is cleared, if not as before.
     once_cleared: Option<Drain>,
 }
@@ -68,6 +71,7 @@ impl Desk {
 
     fn answer(&mut self, message: &[u8], now_ns: i64) -> Vec<u8> {
         if message == [0] {
+            std::thread::sleep(self.pause.take().unwrap_or_default());
             return Vec::new();
         }
         self.frames.push(message.to_vec());
@@ -112,6 +116,7 @@ impl Lab {
             asked: 0,
             most_held: 0,
             noise: b"",
+            pause: None,
             once_cleared: None,
         }));
         let answering = desk.clone();
@@ -142,6 +147,10 @@ impl Lab {
 
 fn is_sample(frame: &[u8]) -> bool {
     frame.starts_with(b"pld\x09")
+}
+
+fn samples(frames: &[Vec<u8>]) -> Vec<Vec<u8>> {
+    frames.iter().filter(|frame| is_sample(frame)).cloned().collect()
 }
 
 /// A dark path that takes seconds.
@@ -237,9 +246,6 @@ fn parking_empties_the_fifo_and_ramps_from_the_sample_that_the_count_tells() {
     // The count is queried three times, since an answer may be lost; the ping shows that all queries have arrived.
     assert_eq!(frames[clearing - 3..clearing], [LEFT, LEFT, LEFT]);
     assert_eq!(frames[clearing + 1], PING);
-    let samples = |frames: &[Vec<u8>]| -> Vec<Vec<u8>> {
-        frames.iter().filter(|frame| is_sample(frame)).cloned().collect()
-    };
     let (before, after) = (samples(&frames[..clearing]), samples(&frames[clearing..]));
     let place = &before[before.len() - 3000 - 1];
     assert_ne!(place, AT_ORIGIN);
@@ -254,6 +260,46 @@ fn parking_empties_the_fifo_and_ramps_from_the_sample_that_the_count_tells() {
         // The mirror's limit, and rounding at both ends.
         let allowed = (LIMITS.max_step.0 / 6.5 * 2047.0) as i32 + 2;
         assert!((0..2).all(|axis| (a[axis] - b[axis]).abs() <= allowed), "{a:?} then {b:?}");
+    }
+}
+
+#[test]
+fn what_a_killed_process_asked_is_no_answer_to_who_parks_after_it() {
+    for pause_ms in [8, 60] {
+        let lab = Lab::new(1000.0);
+        let mut mirror = lab.open();
+        mirror.load(&turn(2000, 1000.0)).unwrap();
+        mirror.start(2).unwrap();
+        let began = Instant::now();
+        while mirror.feed().unwrap().played < 700 {
+            assert!(began.elapsed() < Duration::from_secs(60));
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        // What a killed process leaves: its state, its samples in the FIFO, and the answer to its last query.
+        let left_behind = lab.script.state().with_file_name("left.json");
+        for end in ["", ".sent"] {
+            let file = |path: &Path| PathBuf::from(format!("{}{end}", path.display()));
+            std::fs::copy(file(&lab.script.state()), file(&left_behind)).unwrap();
+        }
+        let sent = lab.frames();
+        drop(mirror);
+        lab.drain(Drain::Holds(3500));
+        std::fs::write(lab.script.pty.path(), LEFT).unwrap();
+        let parked_by_drop = lab.frames().len();
+        while lab.frames().last().unwrap() != LEFT {
+            assert!(began.elapsed() < Duration::from_secs(60));
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        {
+            let mut desk = lab.desk.lock().unwrap();
+            desk.drain = Drain::Holds(3000);
+            desk.once_cleared = Some(Drain::ByClock(1000.0));
+            desk.pause = Some(Duration::from_millis(pause_ms));
+        }
+        assert!(matches!(mirror::park(&left_behind).unwrap(), mirror::Parked::From(_)));
+        let (sent, after) = (samples(&sent), samples(&lab.frames()[parked_by_drop..]));
+        assert_eq!(after[0], sent[sent.len() - 3000 - 1], "dark where it stands");
+        assert_eq!(after.last().unwrap(), AT_ORIGIN);
     }
 }
 

@@ -60,7 +60,7 @@ impl LightOf {
             None => "noise and dark images",
         };
         let about = format!(
-            "standard deviation, through {of}, of {says}; the prior's bias is not in it: see prior-bias"
+            "standard deviation, through {of}, of {says}; without the prior's bias, which the product prior-bias shows"
         );
         Ok(Product::Image { name, about, image, mask })
     }

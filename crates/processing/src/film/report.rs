@@ -13,7 +13,7 @@ use raysweep_session::{Result, Session};
 use super::product::{FilmProducts, FilmVideo};
 use super::task::FilmTask;
 use crate::plane::report::{jitter, settings};
-use crate::report::{accounts, page};
+use crate::report::{accounts, page, remark};
 
 /// Cycles on the contact sheet.
 const SHOWN: usize = 8;
@@ -205,7 +205,7 @@ fn findings(state: &State) -> Option<Section> {
         title: "How the cycles were demultiplexed".into(),
         intro: "From the mean of the first four cycles, which themselves were demultiplexed as planned."
             .into(),
-        blocks: vec![Block::Facts(film.findings.clone())],
+        blocks: film.findings.iter().map(|(what, said)| remark(what, said)).collect(),
     })
 }
 

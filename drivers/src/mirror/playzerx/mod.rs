@@ -334,7 +334,8 @@ pub(super) fn recover(
         return Ok(None);
     };
     let mut port = Port::open(DEVICE, name, BAUD)?;
-    let left = if state.is_plugged_in_since(name, *node) { stream::halt(&mut port, 0)? } else { None };
+    // The process may have died with a query pending.
+    let left = if state.is_plugged_in_since(name, *node) { stream::halt(&mut port, 1)? } else { None };
     let Some(left) = left else {
         // The reset switches off light and drive; the mirror springs back, damped by the drive's own filter.
         let mut bytes = PADDING.to_vec();

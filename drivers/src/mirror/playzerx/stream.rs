@@ -11,6 +11,7 @@ use super::protocol::{
 use crate::mirror::error::fault;
 use crate::mirror::sequence::Sequence;
 use crate::mirror::state::{Sent, StateFile, of_state};
+use crate::serial::patience::Patience;
 use crate::serial::port::Port;
 
 /// Samples per write, which is the uncertainty after a crash: 1.6 ms at 39,000 samples/s, too short for any mirror's
@@ -26,10 +27,20 @@ const ASK_EVERY: Duration = Duration::from_millis(10);
 const LONGEST_ROUND_TRIP: Duration = Duration::from_millis(5);
 /// Maximum time that a controller may pause before it processes a command.
 const HALT_WAIT: Duration = Duration::from_secs(1);
+/// How long to wait until a controller has processed what was sent before; the mirror plays on meanwhile.
+const CONSUMED_WAIT: Duration = Duration::from_millis(20);
 /// How long to wait after an answer for the answers to the other queries sent with it.
 const QUIET: Duration = Duration::from_millis(3);
 /// Number of position queries: an answer may be lost in garbage, and the FIFO can be emptied only once.
 const QUESTIONS: usize = 3;
+
+/// A query for the samples left.
+struct Question {
+    asked: Instant,
+    /// Samples sent before it.
+    sent: u64,
+    patience: Patience,
+}
 
 /// A sequence being played.
 pub struct SampleStream {
@@ -42,8 +53,8 @@ pub struct SampleStream {
     /// Samples sent completely before `out`.
     certain: u64,
     next: u64,
-    /// The pending query: its time, and the samples sent before it.
-    question: Option<(Instant, u64)>,
+    /// The pending query.
+    question: Option<Question>,
     asked: Instant,
     /// Samples sent before the query answered last, and the samples left at that time.
     answer: (u64, u64),
@@ -83,11 +94,18 @@ impl SampleStream {
 
     /// Reads replies and sends as many samples as fit; records in `record` what was sent.
     pub fn step(&mut self, port: &mut Port, record: Option<&StateFile>) -> Result<(), DeviceError> {
-        let looked = Instant::now();
+        let now = Instant::now();
+        let is_over = self.question.as_mut().is_some_and(|question| question.patience.is_over(now));
         while let Some(reply) = port.reply(parse_response)? {
             if let PlayzerXReply::Left(left) = reply {
                 self.take_answer(u64::from(left))?;
             }
+        }
+        if is_over && self.question.is_some() {
+            return Err(fault(
+                DeviceErrorKind::Timeout,
+                "the controller no longer answers: check its cable, or switch it off and on",
+            ));
         }
         for _ in 0..WRITES_PER_STEP {
             if self.written == self.out.len() && !self.fill() {
@@ -97,7 +115,7 @@ impl SampleStream {
                 break;
             }
         }
-        self.check_life(looked)
+        self.check_motion()
     }
 
     /// Puts the next samples and queries into `out`; `false` if there is nothing to send now.
@@ -139,7 +157,8 @@ impl SampleStream {
         let samples = self.next - self.certain;
         if self.out.len() > samples as usize * SAMPLE_BYTES {
             self.asked = Instant::now();
-            self.question = Some((self.asked, self.next));
+            let patience = Patience::new(REPLY_WAIT, self.asked);
+            self.question = Some(Question { asked: self.asked, sent: self.next, patience });
         }
         self.certain = self.next;
         note(Sent { certainly: self.certain, possibly: self.certain })?;
@@ -153,7 +172,7 @@ impl SampleStream {
 
     fn take_answer(&mut self, left: u64) -> Result<(), DeviceError> {
         // An answer without a query, or with an impossible count, is garbage that looks like an answer.
-        let Some((asked, sent)) = self.question else { return Ok(()) };
+        let Some(Question { asked, sent, .. }) = self.question else { return Ok(()) };
         let possible =
             self.began.map_or(0.0, |began| began.elapsed().as_secs_f64()) * self.asked_rate_hz * 1.1 + 2.0;
         let Some(played) =
@@ -196,17 +215,8 @@ impl SampleStream {
         self.is_within_path(self.next) && since.as_secs_f64() * self.asked_rate_hz * 1.1 >= held as f64
     }
 
-    /// Returns an error if the controller does not answer, or if its FIFO does not drain, in which case the mirror
-    /// does not move. `looked` is when its answers were read: answers that arrive while the host is stalled are not
-    /// late.
-    fn check_life(&self, looked: Instant) -> Result<(), DeviceError> {
-        let unanswered = |(asked, _)| looked.saturating_duration_since(asked) > REPLY_WAIT;
-        if self.question.is_some_and(unanswered) {
-            return Err(fault(
-                DeviceErrorKind::Timeout,
-                "the controller no longer answers: check its cable, or switch it off and on",
-            ));
-        }
+    /// Returns an error if the FIFO does not drain, in which case the mirror does not move.
+    fn check_motion(&self) -> Result<(), DeviceError> {
         let waiting = self.began.is_some() && self.played < self.certain && !self.may_have_run_dry();
         if waiting && self.answer_asked.saturating_duration_since(self.moved) > REPLY_WAIT {
             return Err(fault(
@@ -269,21 +279,34 @@ impl SampleStream {
 /// are still pending.
 ///
 /// A controller that sends nothing at all has not processed the command yet, so there is time to wait for it. If it
-/// answers the ping after the queries, it has processed them, and their answers are lost.
+/// answers the last ping after the queries, it has processed them, and their answers are lost.
 pub fn halt(port: &mut Port, unanswered: usize) -> Result<Option<u32>, DeviceError> {
+    // Once this ping is answered, so is all that was asked before it: an old answer, taken for a new one, would put the
+    // mirror where it was milliseconds ago.
+    while port.reply(parse_response)?.is_some() {}
     let mut bytes = PADDING.to_vec();
+    PlayzerXCommand::Ping.to_bytes(&mut bytes);
+    port.send(&bytes)?;
+    let alive = |reply| (reply == PlayzerXReply::Alive).then_some(());
+    let (mut unanswered, mut pings) = match port.await_reply(CONSUMED_WAIT, parse_response, alive)? {
+        Some(()) => (0, 1),
+        None => (unanswered, 2),
+    };
+    bytes.clear();
     (0..QUESTIONS).for_each(|_| PlayzerXCommand::SamplesLeft.to_bytes(&mut bytes));
     PlayzerXCommand::Clear.to_bytes(&mut bytes);
     PlayzerXCommand::Ping.to_bytes(&mut bytes);
     port.send(&bytes)?;
-    let (mut answers, mut last) = (0, None);
+    let mut known = None;
     loop {
-        // The last answer is the closest in time to the clearing.
-        let known = last.filter(|_| answers > unanswered);
         let wait = if known.is_some() { QUIET } else { HALT_WAIT };
         match port.await_reply(wait, parse_response, Some)? {
-            Some(PlayzerXReply::Left(left)) => (answers, last) = (answers + 1, Some(left)),
+            Some(PlayzerXReply::Left(_)) if unanswered > 0 => unanswered -= 1,
+            // The last answer is the closest in time to the clearing.
+            Some(PlayzerXReply::Left(left)) => known = Some(left),
             Some(PlayzerXReply::Info { .. }) => {}
+            // What was answered before the first ping, was asked before it.
+            Some(PlayzerXReply::Alive) if pings > 1 => (known, unanswered, pings) = (None, 0, 1),
             Some(PlayzerXReply::Alive) | None => return Ok(known),
         }
     }

@@ -2,12 +2,13 @@
 //! priors.
 
 use raysweep_pipeline::{Findings, prior_name};
-use raysweep_session::report::{Block, NoteLevel, Section, Table};
+use raysweep_session::report::{Block, Section, Table};
+
+use crate::report::remark;
 
 /// The section about these findings.
 pub(super) fn section(findings: &Findings) -> Section {
-    let note = |(what, said): &(&str, String)| Block::Note(NoteLevel::Info, format!("{what}: {said}"));
-    let mut blocks: Vec<Block> = findings.remarks.iter().map(note).collect();
+    let mut blocks: Vec<Block> = findings.remarks.iter().map(|(what, said)| remark(what, said)).collect();
     blocks.extend(curve(findings));
     if !findings.left_out_us.is_empty() {
         let row = |(delay_us, exposure_us): &(f64, f64)| {
