@@ -20,7 +20,7 @@ pub(crate) fn named<const N: usize>(facts: [(&str, String); N]) -> Vec<(String, 
     facts.map(|(name, fact)| (name.to_owned(), fact)).to_vec()
 }
 
-/// Something found in the data, and about what.
+/// What was found, and about what.
 pub(crate) fn remark(what: &str, said: &str) -> Block {
     Block::Note(NoteLevel::Info, format!("{what}: {said}"))
 }
@@ -47,12 +47,14 @@ pub(crate) fn accounts(state: &State) -> Vec<Block> {
     let mut rows = vec![
         row("expected triggers", counts.expected, "frames that the camera should have sent"),
         row("averaged", counts.averaged, "in the stored images, black pictures and whole periods included"),
-        row("settling", counts.settling, "perhaps taken with the settings before"),
+        row("settling", counts.settling, "possibly still taken with the previous settings"),
         row("cancelled", counts.cancelled, "not needed: between passes, or around a pause or an end"),
     ];
     rows.extend(counts.lost.iter().map(|(cause, &frames)| row(&format!("lost: {cause}"), frames, "")));
-    let mut blocks =
-        vec![Block::Table(Table { headers: ["frames", "count", ""].map(str::to_owned).to_vec(), rows })];
+    let mut blocks = vec![Block::Table(Table {
+        headers: ["frames", "count", "meaning"].map(str::to_owned).to_vec(),
+        rows,
+    })];
     if !counts.balanced() {
         blocks.push(Block::Note(
             NoteLevel::Error,

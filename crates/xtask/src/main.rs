@@ -1,5 +1,5 @@
-//! `cargo xtask demo | test | packages | fresh | deb | guest | soak | bench`: the project's own commands. Uses only
-//! std, so that it builds quickly everywhere.
+//! `cargo xtask demo | test | packages | fresh | deb | guest | soak | bench`: the project's own commands. Apart
+//! from std it uses the small clang-sys alone, so that it builds quickly everywhere.
 
 mod bench;
 mod daemon;

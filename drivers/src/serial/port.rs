@@ -9,7 +9,7 @@ use nix::errno::Errno;
 use raysweep_core::{DeviceError, DeviceErrorKind};
 use serialport::{DataBits, FlowControl, Parity, SerialPort, StopBits, TTYPort};
 
-use super::patience::Patience;
+use super::timeout::Timeout;
 use super::wire::{Parsed, Receiver};
 
 /// Maximum time for the port to accept bytes in one call: a feeding loop must return to reading.
@@ -143,9 +143,9 @@ impl Port {
         parse: impl Fn(&[u8]) -> Parsed<R>,
         mut pick: impl FnMut(R) -> Option<T>,
     ) -> Result<Option<T>, DeviceError> {
-        let mut patience = Patience::new(timeout, Instant::now());
+        let mut timeout = Timeout::new(timeout, Instant::now());
         loop {
-            let is_over = patience.is_over(Instant::now());
+            let is_over = timeout.look(Instant::now());
             while let Some(reply) = self.reply(&parse)? {
                 if let Some(picked) = pick(reply) {
                     return Ok(Some(picked));

@@ -233,10 +233,10 @@ fn libclang() -> Done {
         let why = "must be an absolute path: build scripts, which search there, run in other folders";
         return Err(format!("LIBCLANG_PATH={}: {why}", place.display()));
     }
-    // It panics if `llvm-config --prefix` prints nothing.
-    std::panic::catch_unwind(clang_sys::load_manually)
-        .unwrap_or_else(|_| Err("the crate clang-sys panics while it searches".to_owned()))
-        .map(|_| ())
+    let found = std::panic::catch_unwind(clang_sys::load_manually).unwrap_or_else(|_| {
+        Err("clang-sys panicked while it searched; does `llvm-config --prefix` print nothing?".to_owned())
+    });
+    found.map(|_| ())
 }
 
 /// Compiles and links an empty program.

@@ -11,8 +11,8 @@ use super::protocol::{
 use crate::mirror::error::fault;
 use crate::mirror::sequence::Sequence;
 use crate::mirror::state::{Sent, StateFile, of_state};
-use crate::serial::patience::Patience;
 use crate::serial::port::Port;
+use crate::serial::timeout::Timeout;
 
 /// Samples per write, which is the uncertainty after a crash: 1.6 ms at 39,000 samples/s, too short for any mirror's
 /// filter to pass.
@@ -27,8 +27,6 @@ const ASK_EVERY: Duration = Duration::from_millis(10);
 const LONGEST_ROUND_TRIP: Duration = Duration::from_millis(5);
 /// Maximum time that a controller may pause before it processes a command.
 const HALT_WAIT: Duration = Duration::from_secs(1);
-/// How long to wait until a controller has processed what was sent before; the mirror plays on meanwhile.
-const CONSUMED_WAIT: Duration = Duration::from_millis(20);
 /// How long to wait after an answer for the answers to the other queries sent with it.
 const QUIET: Duration = Duration::from_millis(3);
 /// Number of position queries: an answer may be lost in garbage, and the FIFO can be emptied only once.
@@ -39,7 +37,7 @@ struct Question {
     asked: Instant,
     /// Samples sent before it.
     sent: u64,
-    patience: Patience,
+    timeout: Timeout,
 }
 
 /// A sequence being played.
@@ -95,7 +93,7 @@ impl SampleStream {
     /// Reads replies and sends as many samples as fit; records in `record` what was sent.
     pub fn step(&mut self, port: &mut Port, record: Option<&StateFile>) -> Result<(), DeviceError> {
         let now = Instant::now();
-        let is_over = self.question.as_mut().is_some_and(|question| question.patience.is_over(now));
+        let is_over = self.question.as_mut().is_some_and(|question| question.timeout.look(now));
         while let Some(reply) = port.reply(parse_response)? {
             if let PlayzerXReply::Left(left) = reply {
                 self.take_answer(u64::from(left))?;
@@ -146,19 +144,21 @@ impl SampleStream {
     fn write(&mut self, port: &mut Port, record: Option<&StateFile>) -> Result<bool, DeviceError> {
         let note = |sent| record.map_or(Ok(()), |record| record.note_sent(sent).map_err(of_state));
         note(Sent { certainly: self.certain_now(), possibly: self.next })?;
+        // Before the write: the controller may have played samples by the time that a busy host returns from it.
+        let now = Instant::now();
         let written = port.write_some(&self.out[self.written..])?;
         self.written += written;
         if self.began.is_none() && written > 0 {
-            (self.began, self.moved) = (Some(Instant::now()), Instant::now());
+            (self.began, self.moved) = (Some(now), now);
         }
         if self.written < self.out.len() {
             return Ok(false);
         }
         let samples = self.next - self.certain;
         if self.out.len() > samples as usize * SAMPLE_BYTES {
-            self.asked = Instant::now();
-            let patience = Patience::new(REPLY_WAIT, self.asked);
-            self.question = Some(Question { asked: self.asked, sent: self.next, patience });
+            self.asked = now;
+            let timeout = Timeout::new(REPLY_WAIT, now);
+            self.question = Some(Question { asked: now, sent: self.next, timeout });
         }
         self.certain = self.next;
         note(Sent { certainly: self.certain, possibly: self.certain })?;
@@ -279,34 +279,21 @@ impl SampleStream {
 /// are still pending.
 ///
 /// A controller that sends nothing at all has not processed the command yet, so there is time to wait for it. If it
-/// answers the last ping after the queries, it has processed them, and their answers are lost.
+/// answers the ping after the queries, it has processed them, and their answers are lost.
 pub fn halt(port: &mut Port, unanswered: usize) -> Result<Option<u32>, DeviceError> {
-    // Once this ping is answered, so is all that was asked before it: an old answer, taken for a new one, would put the
-    // mirror where it was milliseconds ago.
-    while port.reply(parse_response)?.is_some() {}
     let mut bytes = PADDING.to_vec();
-    PlayzerXCommand::Ping.to_bytes(&mut bytes);
-    port.send(&bytes)?;
-    let alive = |reply| (reply == PlayzerXReply::Alive).then_some(());
-    let (mut unanswered, mut pings) = match port.await_reply(CONSUMED_WAIT, parse_response, alive)? {
-        Some(()) => (0, 1),
-        None => (unanswered, 2),
-    };
-    bytes.clear();
     (0..QUESTIONS).for_each(|_| PlayzerXCommand::SamplesLeft.to_bytes(&mut bytes));
     PlayzerXCommand::Clear.to_bytes(&mut bytes);
     PlayzerXCommand::Ping.to_bytes(&mut bytes);
     port.send(&bytes)?;
-    let mut known = None;
+    let (mut answers, mut last) = (0, None);
     loop {
+        // The last answer is the closest in time to the clearing.
+        let known = last.filter(|_| answers > unanswered);
         let wait = if known.is_some() { QUIET } else { HALT_WAIT };
         match port.await_reply(wait, parse_response, Some)? {
-            Some(PlayzerXReply::Left(_)) if unanswered > 0 => unanswered -= 1,
-            // The last answer is the closest in time to the clearing.
-            Some(PlayzerXReply::Left(left)) => known = Some(left),
+            Some(PlayzerXReply::Left(left)) => (answers, last) = (answers + 1, Some(left)),
             Some(PlayzerXReply::Info { .. }) => {}
-            // What was answered before the first ping, was asked before it.
-            Some(PlayzerXReply::Alive) if pings > 1 => (known, unanswered, pings) = (None, 0, 1),
             Some(PlayzerXReply::Alive) | None => return Ok(known),
         }
     }

@@ -1,0 +1,51 @@
+//! How long a device is waited for.
+
+use std::time::{Duration, Instant};
+
+/// Minimum number of looks before a timeout is over.
+const LOOKS: u32 = 16;
+
+/// A timeout of which each look uses up at most a sixteenth, so that a host that stands still does not use it up.
+#[derive(Debug)]
+pub(crate) struct Timeout {
+    most_per_look: Duration,
+    left: Duration,
+    looked: Instant,
+}
+
+impl Timeout {
+    pub fn new(time: Duration, now: Instant) -> Self {
+        Self { most_per_look: (time / LOOKS).max(Duration::from_nanos(1)), left: time, looked: now }
+    }
+
+    /// Whether the timeout is over with this look. Call it before looking: what arrived while the host stood still is
+    /// not late.
+    pub fn look(&mut self, now: Instant) -> bool {
+        let passed = now.saturating_duration_since(self.looked).min(self.most_per_look);
+        (self.left, self.looked) = (self.left.saturating_sub(passed), now);
+        self.left.is_zero()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_host_that_stands_still_does_not_use_it_up() {
+        let began = Instant::now();
+        let ms = |ms| began + Duration::from_millis(ms);
+        let mut timeout = Timeout::new(Duration::from_millis(160), began);
+        assert!(!timeout.look(ms(100_000)));
+        assert!((1..15).all(|look| !timeout.look(ms(100_000 + 1000 * look))));
+        assert!(timeout.look(ms(115_000)));
+    }
+
+    #[test]
+    fn who_looks_often_waits_for_the_time_stated() {
+        let began = Instant::now();
+        let mut timeout = Timeout::new(Duration::from_millis(160), began);
+        let over = (1..).find(|&ms| timeout.look(began + Duration::from_millis(ms)));
+        assert_eq!(over, Some(160));
+    }
+}
