@@ -96,10 +96,12 @@ impl Lab {
     fn play_plan(&self, plan: String, samples: usize) -> Process {
         let daemon = self.daemon();
         let params = RunParams { plan, ..RunParams::default() };
-        self.client().run(&params).unwrap();
+        let mut client = self.client();
+        client.run(&params).unwrap();
         let began = Instant::now();
         while self.lit() < samples {
-            assert!(began.elapsed() < HUNG, "no light\n{}", self.log());
+            let has_faulted = client.status().unwrap().state == RunState::Faulted;
+            assert!(!has_faulted && began.elapsed() < HUNG, "no light\n{}", self.log());
             std::thread::sleep(Duration::from_millis(5));
         }
         daemon

@@ -5,8 +5,10 @@ use serde::{Deserialize, Serialize};
 
 /// How long the mirror rests, dark, before and after a movement: late samples of the host do no harm in this time.
 const DWELL_S: f64 = 0.01;
-/// The same before a path: time to fill the controller's FIFO and to measure its rate.
-const LEAD_S: f64 = 0.25;
+/// The same before a path: time to fill the controller's FIFO, which a path must not outrun, on a busy host too.
+const LEAD_S: f64 = 0.5;
+/// The same after the approach to a path: time to measure the controller's rate.
+const MEASURE_S: f64 = 0.25;
 
 /// Points played once, then points played repeatedly, then points played once.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -44,7 +46,7 @@ impl Sequence {
     /// The same, with a longer rest at the end.
     pub fn approach(from: Tilt, to: Tilt, rate_hz: f64, limits: &MirrorLimits) -> Self {
         let mut sequence = Self::travel(from, to, rate_hz, limits);
-        sequence.tail = dwell(to, rate_hz, LEAD_S).collect();
+        sequence.tail = dwell(to, rate_hz, MEASURE_S).collect();
         sequence
     }
 

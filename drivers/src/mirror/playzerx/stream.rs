@@ -17,8 +17,9 @@ use crate::serial::timeout::Timeout;
 /// Samples per write, which is the uncertainty after a crash: 1.6 ms at 39,000 samples/s, too short for any mirror's
 /// filter to pass.
 const WRITE_SAMPLES: u64 = 64;
-/// Writes per step, so that the caller can attend to its other duties.
-const WRITES_PER_STEP: usize = 64;
+/// Writes per step: 0.4 s of motion, so that a busy host that comes by rarely feeds faster than the mirror plays; few
+/// enough for the caller to attend to its other duties.
+const WRITES_PER_STEP: usize = 256;
 /// Part of the FIFO that is never used, in case the controller reserves some of it [A].
 const SPARE_SAMPLES: u64 = 1000;
 /// Interval of querying the samples left.
