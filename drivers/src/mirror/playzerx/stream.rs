@@ -26,6 +26,8 @@ const SPARE_SAMPLES: u64 = 1000;
 const ASK_EVERY: Duration = Duration::from_millis(10);
 /// The time of an answer with a longer round trip is too uncertain.
 const LONGEST_ROUND_TRIP: Duration = Duration::from_millis(5);
+/// Maximum time for an answer while the FIFO, of three seconds, plays on.
+const ANSWER_WAIT: Duration = Duration::from_secs(1);
 /// Maximum time that a controller may pause before it processes a command.
 const HALT_WAIT: Duration = Duration::from_secs(1);
 /// How long to wait after an answer for the answers to the other queries sent with it.
@@ -158,7 +160,7 @@ impl SampleStream {
         let samples = self.next - self.certain;
         if self.out.len() > samples as usize * SAMPLE_BYTES {
             self.asked = now;
-            let timeout = Timeout::new(REPLY_WAIT, now);
+            let timeout = Timeout::new(ANSWER_WAIT, now);
             self.question = Some(Question { asked: now, sent: self.next, timeout });
         }
         self.certain = self.next;
