@@ -21,6 +21,9 @@ const SEND_WAIT: Duration = Duration::from_millis(500);
 const LOCK_WAIT: Duration = Duration::from_millis(500);
 const LOCK_PACE: Duration = Duration::from_millis(10);
 
+/// How long to wait for bytes between two looks at a timeout.
+const LOOK_EVERY: Duration = Duration::from_millis(1);
+
 /// After this long without a reply, none is on its way: a line at 115,200 baud and a USB adapter's 16 ms are faster.
 const SILENCE: Duration = Duration::from_millis(50);
 /// A device that sends more unrequested replies than this never falls silent.
@@ -154,7 +157,7 @@ impl Port {
             if is_over {
                 return Ok(None);
             }
-            std::thread::sleep(Duration::from_micros(200));
+            self.wait(LOOK_EVERY)?;
         }
     }
 

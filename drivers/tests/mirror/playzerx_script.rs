@@ -281,10 +281,12 @@ fn an_answer_to_a_killed_process_does_not_tell_the_place_to_whoever_parks_next()
             let file = |path: &Path| PathBuf::from(format!("{}{end}", path.display()));
             std::fs::copy(file(&lab.script.state()), file(&left_behind)).unwrap();
         }
-        let sent = lab.frames();
         drop(mirror);
         lab.drain(Drain::Holds(3500));
-        let parked_by_drop = lab.frames().len();
+        let before = lab.frames();
+        let clearing = before.iter().position(|frame| frame == CLEAR).unwrap();
+        let sent = samples(&before[..clearing]);
+        let parked_by_drop = before.len();
         std::fs::write(lab.script.pty.path(), LEFT).unwrap();
         while lab.frames().len() == parked_by_drop {
             assert!(began.elapsed() < Duration::from_secs(60));
@@ -297,7 +299,7 @@ fn an_answer_to_a_killed_process_does_not_tell_the_place_to_whoever_parks_next()
             desk.pause = Some(Duration::from_millis(pause_ms));
         }
         assert!(matches!(mirror::park(&left_behind).unwrap(), mirror::Parked::From(_)));
-        let (sent, after) = (samples(&sent), samples(&lab.frames()[parked_by_drop..]));
+        let after = samples(&lab.frames()[parked_by_drop..]);
         assert_eq!(after[0], sent[sent.len() - 3000 - 1], "dark where it stands");
         assert_eq!(after.last().unwrap(), AT_ORIGIN);
     }
