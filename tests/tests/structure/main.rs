@@ -69,15 +69,13 @@ fn crates_depend_on_each_other_as_allowed() {
         seen.insert(name.to_owned());
         let dependencies = package["dependencies"].as_array().unwrap().iter();
         let normal = dependencies.filter(|dependency| dependency["kind"].is_null());
-        let mut external = 0;
         for dependency in normal.map(|dependency| dependency["name"].as_str().unwrap()) {
-            external += usize::from(!dependency.starts_with("raysweep"));
+            assert!(name != "xtask" || dependency == "clang-sys", "xtask must build quickly: {dependency}");
             assert!(
                 !dependency.starts_with("raysweep") || edges.contains(&dependency),
                 "{name} must not depend on {dependency}"
             );
         }
-        assert!(name != "xtask" || external == 0, "xtask depends on nothing but std");
     }
     assert_eq!(seen.len(), allowed.len(), "crates are missing: {seen:?}");
 }
