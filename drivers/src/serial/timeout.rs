@@ -4,8 +4,8 @@ use std::time::{Duration, Instant};
 
 /// Minimum number of looks before a timeout is over.
 const LOOKS: u32 = 16;
-/// The most that a look uses up; who waits, looks more often. On a host with 10 runnable threads on 2 processors, threads
-/// and the kernel's own workers, through which a serial line's bytes pass, were seen to wait for 0.3 s.
+/// The most that a look uses up, which is longer than the pace at which a port is looked at. With 10 runnable threads on
+/// 2 processors, the kernel's workers, through which a serial line's bytes pass, were seen to wait for 0.3 s.
 const LOOK: Duration = Duration::from_millis(2);
 
 /// A timeout of which each look uses up little, so that a host that stands still or is busy does not use it up.

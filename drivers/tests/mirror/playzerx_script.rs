@@ -153,6 +153,16 @@ fn samples(frames: &[Vec<u8>]) -> Vec<Vec<u8>> {
     frames.iter().filter(|frame| is_sample(frame)).cloned().collect()
 }
 
+/// Feeds until so many samples are played; returns when that began.
+fn feed_until_played(mirror: &mut PlayzerX, samples: u64) -> Instant {
+    let began = Instant::now();
+    while mirror.feed().unwrap().played < samples {
+        assert!(began.elapsed() < Duration::from_secs(60));
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    began
+}
+
 /// A dark path that takes seconds.
 fn turn(samples: usize, rate_hz: f64) -> MirrorPath {
     let path = MirrorPath::lissajous(Tilt::new(1.0, 0.5), [1, 1], samples, rate_hz, &LIMITS).unwrap();
@@ -211,11 +221,7 @@ fn a_host_that_stands_still_is_no_fault_of_the_controller() {
     let mut mirror = lab.open();
     mirror.load(&turn(2000, 1000.0)).unwrap();
     mirror.start(2).unwrap();
-    let began = Instant::now();
-    while mirror.feed().unwrap().played < 100 {
-        assert!(began.elapsed() < Duration::from_secs(60));
-        std::thread::sleep(Duration::from_millis(1));
-    }
+    feed_until_played(&mut mirror, 100);
     // The FIFO contains more than a second of samples, and no answer may be pending for longer than that.
     for _ in 0..5 {
         std::thread::sleep(Duration::from_millis(400));
@@ -232,11 +238,7 @@ fn parking_empties_the_fifo_and_ramps_from_the_sample_that_the_count_tells() {
     let mut mirror = lab.open();
     mirror.load(&turn(2000, 1000.0)).unwrap();
     mirror.start(2).unwrap();
-    let began = Instant::now();
-    while mirror.feed().unwrap().played < 700 {
-        assert!(began.elapsed() < Duration::from_secs(60));
-        std::thread::sleep(Duration::from_millis(1));
-    }
+    feed_until_played(&mut mirror, 700);
     // The controller stops with 3000 samples left, and works again when it is parked.
     lab.desk.lock().unwrap().once_cleared = Some(Drain::ByClock(1000.0));
     lab.drain(Drain::Holds(3000));
@@ -270,11 +272,7 @@ fn an_answer_to_a_killed_process_does_not_tell_the_place_to_whoever_parks_next()
         let mut mirror = lab.open();
         mirror.load(&turn(2000, 1000.0)).unwrap();
         mirror.start(2).unwrap();
-        let began = Instant::now();
-        while mirror.feed().unwrap().played < 700 {
-            assert!(began.elapsed() < Duration::from_secs(60));
-            std::thread::sleep(Duration::from_millis(1));
-        }
+        let began = feed_until_played(&mut mirror, 700);
         // What a killed process leaves: its state, its samples in the FIFO, and the answer to its last query.
         let left_behind = lab.script.state().with_file_name("left.json");
         for end in ["", ".sent"] {
@@ -313,11 +311,7 @@ fn a_controller_that_plays_nothing_is_told_by_its_count() {
     mirror.start(2).unwrap();
     mirror.feed().unwrap();
     // The count stays at about 4000 samples in all answers.
-    let began = Instant::now();
-    while mirror.feed().unwrap().played < 100 {
-        assert!(began.elapsed() < Duration::from_secs(60));
-        std::thread::sleep(Duration::from_millis(1));
-    }
+    let began = feed_until_played(&mut mirror, 100);
     let left = {
         let mut desk = lab.desk.lock().unwrap();
         let now_ns = raysweep_core::Clock::real().now_ns();
