@@ -1,5 +1,6 @@
 //! Plays a path with the mirror while the camera takes its frames, and has the operator place subjects.
 
+use std::any::Any;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread;
 
@@ -95,24 +96,36 @@ impl Player<'_> {
                     taken
                 })
                 .map_err(|source| PipelineError::Spawn { name: "camera", source: source.into() })?;
-            let fed = {
+            let motion = &mut *self.motion;
+            let mirror = thread::Builder::new().name("mirror".into()).spawn_scoped(scope, || {
+                // A controller that runs out of samples lets the mirror stand.
+                if pace == Pace::Devices && !is_simulated && is_driven {
+                    priority::for_device("mirror");
+                }
                 let _over = SetOnDrop(&path_over);
                 let go_on = || {
                     orders.go_on() && !enough.load(Ordering::Relaxed) && !camera_over.load(Ordering::Relaxed)
                 };
-                self.motion.play(&clock, &go_on)
-            };
-            if fed.is_err() {
-                orders.give(Order::Fault);
-            }
-            Ok((fed, camera.join()))
+                let fed = motion.play(&clock, &go_on);
+                if fed.is_err() {
+                    orders.give(Order::Fault);
+                }
+                fed
+            });
+            let mirror = mirror.map_err(|source| {
+                // Nobody moves the mirror: the camera has nothing to wait for.
+                path_over.store(true, Ordering::Relaxed);
+                PipelineError::Spawn { name: "mirror", source: source.into() }
+            })?;
+            Ok((mirror.join(), camera.join()))
         })?;
-        fed?;
-        match taken {
-            Ok(taken) => Ok(taken?),
-            Err(panic) => Err(RunError::Panicked(message_of(&*panic).to_owned())),
-        }
+        fed.map_err(panicked)??;
+        Ok(taken.map_err(panicked)??)
     }
+}
+
+fn panicked(panic: Box<dyn Any + Send>) -> RunError {
+    RunError::Panicked(message_of(&*panic).to_owned())
 }
 
 /// Tells the other thread that this one is over, even if it panics.
