@@ -115,10 +115,18 @@ impl Player<'_> {
             let mirror = mirror.map_err(|source| {
                 // Nobody moves the mirror: the camera has nothing to wait for.
                 path_over.store(true, Ordering::Relaxed);
+                orders.give(Order::Fault);
                 PipelineError::Spawn { name: "mirror", source: source.into() }
             })?;
-            Ok((mirror.join(), camera.join()))
+            let fed = mirror.join();
+            if fed.is_err() {
+                orders.give(Order::Fault);
+            }
+            Ok((fed, camera.join()))
         })?;
+        if let (Err(_) | Ok(Err(_)), Ok(Err(error))) = (&fed, &taken) {
+            tracing::error!(%error, "the camera failed as well as the mirror");
+        }
         fed.map_err(panicked)??;
         Ok(taken.map_err(panicked)??)
     }
