@@ -11,6 +11,8 @@ const NEAR_US: f64 = 2.0;
 const DOUBT: f64 = 2.0;
 /// One still further is not adopted: the rig, or something before it, has moved.
 const ADOPTED_US: f64 = 5.0;
+/// One less certain than this is adopted only if the calibration's own is less certain still.
+const CERTAIN_US: f64 = 0.5;
 /// Direct light further from its place causes a warning.
 const NEAR_ROWS: f64 = 0.1;
 
@@ -41,35 +43,38 @@ pub(crate) struct Images<'a> {
 }
 
 impl CalibrationDrift {
-    /// Finds it from images with these settings.
-    pub(crate) fn of(timing: &RowTiming, settings: &[Setting], images: &Images<'_>) -> Self {
+    /// Finds it from images with these settings. `known_us` is the standard deviation of the calibration's latency.
+    pub(crate) fn of(timing: &RowTiming, settings: &[Setting], images: &Images<'_>, known_us: f64) -> Self {
         let mut drift =
             Self { late_us: 0.0, late_sd_us: None, u0_rows: None, remarks: Vec::new(), warnings: Vec::new() };
-        drift.find_latency(timing, settings, images);
+        drift.find_latency(timing, settings, images, known_us);
         drift.find_place(timing, settings, images);
         drift
     }
 
-    fn find_latency(&mut self, timing: &RowTiming, settings: &[Setting], images: &Images<'_>) {
+    fn find_latency(&mut self, timing: &RowTiming, settings: &[Setting], images: &Images<'_>, known_us: f64) {
         let &Images { rows, images, valid } = images;
         let said = match latency(timing, settings, rows, images, valid) {
             Err(error) => format!("as calibrated: {error}"),
             Ok(found) => {
-                let late_us = found.late_us;
+                let (late_us, sd_us) = (found.late_us, found.standard_error_us);
                 let than = if late_us < 0.0 { "earlier" } else { "later" };
                 let comes = format!("light comes {:.2} us {than} than calibrated", late_us.abs());
-                if late_us.abs() > ADOPTED_US {
+                let is_certain = sd_us <= known_us.max(CERTAIN_US);
+                let doubt_us = if is_certain { 0.0 } else { DOUBT * sd_us };
+                if late_us.abs() > ADOPTED_US + doubt_us {
                     self.warnings.push(format!(
                         "{comes}, too much to be corrected: the times of the calibration are kept, but the rig has moved: calibrate again"
                     ));
-                } else {
+                } else if is_certain {
                     self.late_us = late_us;
-                    self.late_sd_us = Some(found.standard_error_us);
-                    if late_us.abs() > NEAR_US + DOUBT * found.standard_error_us {
+                    self.late_sd_us = Some(sd_us);
+                    if late_us.abs() > NEAR_US + DOUBT * sd_us {
                         self.warnings.push(format!("{comes}: calibrate again soon"));
                     }
                 }
-                format!("{comes} (± {:.2} us), from {} pixels", found.standard_error_us, found.pixels)
+                let kept = if is_certain { "" } else { ", too uncertain to be used" };
+                format!("{comes} (± {sd_us:.2} us), from {} pixels{kept}", found.pixels)
             }
         };
         self.remarks.push(("latency", said));

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use std::ops::Range;
 
 use ndarray::{Array3, Axis, s};
-use raysweep_transport::plane::board::CalibrationCovariance;
+use raysweep_transport::plane::board::{CalibrationCovariance, CalibrationParameter};
 use raysweep_transport::plane::calibrate::{
     BeamEstimate, CalibrateError, Choice, Optics, OpticsEstimate, Sample, candidates, choose_prior,
     estimate_optics,
@@ -87,11 +87,12 @@ pub fn choose(
 ) -> Result<Choices, PlaneError> {
     let mut findings = Findings::planned(planned.prior(), geometry);
     let cut = SpotCut::of(geometry, &stack.timing, &stack.settings)?;
-    findings.add_spot(geometry.spot, &cut, &stack.settings);
+    findings.add_spot(geometry, &cut, &stack.settings);
     let settings = stack.settings.clone();
     stack.keep(|n| cut.is_steady(n));
     let calibration = geometry.calibration.as_ref().map(|calibration| {
-        let late_sd_us = findings.check_calibration(&mut stack, rows);
+        let known_us = calibration.covariance.sd(CalibrationParameter::Latency);
+        let late_sd_us = findings.check_calibration(&mut stack, rows, known_us);
         late_sd_us.map_or(calibration.covariance, |sd_us| calibration.covariance.with_latency_sd(sd_us))
     });
     let late_us = findings.late_us.unwrap_or(0.0);
@@ -173,11 +174,11 @@ impl Findings {
     }
 
     /// Adds what is done about a flying spot in the images of these settings.
-    fn add_spot(&mut self, drawn: Spot, cut: &SpotCut, settings: &[Setting]) {
-        let Spot::Flying(_) = drawn else { return };
+    fn add_spot(&mut self, geometry: &SweepGeometry, cut: &SpotCut, settings: &[Setting]) {
+        let Spot::Flying(_) = geometry.spot else { return };
         let said = match cut {
             SpotCut::Nowhere => "no exposure begins or ends while it draws the direct row".into(),
-            SpotCut::Everywhere => "every exposure begins or ends while it draws the direct row, so none is left out and direct light is not to be trusted: move the delays by a row".into(),
+            SpotCut::Everywhere => "every exposure begins or ends while it draws the direct row, so none is left out and direct light is not to be trusted: move the delays by a few rows".into(),
             SpotCut::Modelled { cut, .. } => format!(
                 "modelled in the {} images whose exposure begins or ends while it draws the direct row",
                 cut.len()
@@ -185,8 +186,12 @@ impl Findings {
             SpotCut::LeftOut { cut } => {
                 let at = |&n: &usize| (settings[n].delays_us[0], settings[n].exposure_us);
                 self.left_out_us = cut.iter().map(at).collect();
+                let unknown = match geometry.calibration {
+                    Some(_) => "",
+                    None => ", and the rig file does not say when it passes a pixel (projector.scan, camera.projector_columns, projector.beam_sigma_rows = 0)",
+                };
                 format!(
-                    "{} images are left out, because their exposure begins or ends while it draws the direct row, and the rig file does not say when it passes a pixel (projector.scan, camera.projector_columns, projector.beam_sigma_rows = 0); {} are kept",
+                    "{} images are left out, because their exposure begins or ends while it draws the direct row{unknown}; {} are kept",
                     cut.len(),
                     settings.len() - cut.len()
                 )
@@ -195,12 +200,13 @@ impl Findings {
         self.remarks.push(("flying spot", said));
     }
 
-    /// Checks the calibration by a stack that contains only the camera rows `rows`, and corrects the delays of its
+    /// Checks the calibration, whose latency has the standard deviation `known_us`, by a stack that contains only the
+    /// camera rows `rows`, and corrects the delays of its
     /// images for the latency found. Returns the standard deviation of that latency.
-    fn check_calibration(&mut self, stack: &mut SweepStack, rows: &[usize]) -> Option<f64> {
+    fn check_calibration(&mut self, stack: &mut SweepStack, rows: &[usize], known_us: f64) -> Option<f64> {
         let valid = stack.valid.as_ref().map(|valid| valid.view());
         let images = calibrated::Images { rows, images: stack.images.view(), valid };
-        let drift = calibrated::CalibrationDrift::of(&stack.timing, &stack.settings, &images);
+        let drift = calibrated::CalibrationDrift::of(&stack.timing, &stack.settings, &images, known_us);
         stack.settings.iter_mut().for_each(|setting| *setting = setting.earlier(drift.late_us));
         self.late_us = Some(drift.late_us);
         self.u0_rows = drift.u0_rows.unwrap_or(0.0);
