@@ -1,14 +1,11 @@
 //! What a pattern lights of a scene: the rows that the projector draws, and the scene's transport under each kind of them.
 
 use ndarray::{Array3, ArrayView4, Axis, s};
-use raysweep_core::{Mosaic, Pattern};
+use raysweep_core::{Mosaic, PROJECTOR_COLUMNS, Pattern};
 
 use crate::error::SimError;
 use crate::lens::DefocusDisc;
 use crate::scene::{Scene, SceneError};
-
-/// Columns of the projector's picture.
-pub const PROJECTOR_COLUMNS: usize = 1280;
 
 /// A pattern as the rows that the projector draws, of which many are alike.
 pub struct DrawnRows {

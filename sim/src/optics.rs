@@ -6,9 +6,9 @@
 use ndarray::{Array2, Array3, Axis, s};
 use rayon::prelude::*;
 use raysweep_config::sim::{RowTable, SimBeam, SimBoard, SimProjector, SimSpot};
-use raysweep_core::{Mosaic, Pattern, Raster};
+use raysweep_core::{Mosaic, PROJECTOR_COLUMNS, Pattern, Raster};
 
-use crate::drawn::{DrawnRows, PROJECTOR_COLUMNS, transports};
+use crate::drawn::{DrawnRows, transports};
 use crate::error::SimError;
 use crate::keyed::{Purpose, keyed, uniform};
 use crate::lens::DefocusDisc;

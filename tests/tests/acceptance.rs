@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use ndarray::{Array2, Array3, ArrayView3, Axis, s};
 use raysweep::rig::Rig;
-use raysweep_processing::calibration::KeptCalibration;
+use raysweep_processing::calibration::{KeptCalibration, Scanning};
 use raysweep_session::film::TransportFilm;
 use raysweep_sim::PlaneRig;
 use raysweep_tests::{Bench, Ended, rig_text};
@@ -137,6 +137,38 @@ fn an_unknown_rig_sees_the_corner_like_a_known_one() {
     let [(calibrated, known)] = found_and_known(&rig, |bench, sim| [error_of_sweep(&bench.run(SWEEP), sim)]);
     println!("error of T: {calibrated:.4} calibrated, {known:.4} known");
     assert!(known < 0.035 && calibrated < MOST * known);
+}
+
+/// The rig file does not say that a spot draws the rows. The scene is seen at other columns of the projector than the
+/// board.
+#[test]
+fn a_flying_spot_is_found_by_the_calibration() {
+    let scene = raysweep_tests::data("p2r_corner.npz");
+    for (spot, rows) in [("one-way", Scanning::OneWay), ("bidirectional", Scanning::Bidirectional)] {
+        let unknown = UNKNOWN.replace("JITTER", "0.5");
+        let unknown = unknown.replace("[sim.projector]\n", &format!("[sim.projector]\nspot = \"{spot}\"\n"));
+        let rig = calibrated(&scene, &format!("{unknown}[sim.board]\nprojector_columns = [0.1, 0.6]\n"));
+        let (_, loaded, found) = &rig;
+        let drawing = found.header.drawing.clone().unwrap();
+        assert_eq!(drawing.rows, rows);
+        assert!(
+            std::iter::zip(drawing.columns.unwrap(), [0.1, 0.6])
+                .all(|(found, set)| (found - set).abs() < 0.01)
+        );
+        let late_us = loaded.simulated().unwrap().truth().trigger_latency_us - STATED_LATENCY_US;
+        let starts_us = loaded.simulated().unwrap().row_starts_us().unwrap();
+        let [first, end] = found.header.timing.seen_rows;
+        let worst_us = (first..=end)
+            .map(|v| (found.arrays.row_starts_us[v] - starts_us[v] + late_us).abs())
+            .fold(0.0, f64::max);
+        let [(calibrated, known)] =
+            found_and_known(&rig, |bench, sim| [error_of_sweep(&bench.run(EDGES), sim)]);
+        println!(
+            "{spot}: rows {worst_us:.2} us off; error of T: {calibrated:.4} calibrated, {known:.4} known"
+        );
+        assert!(worst_us < 1.5 + 0.05 * ROW_TIME_US);
+        assert!(known < 0.035 && calibrated < MOST * known);
+    }
 }
 
 #[test]

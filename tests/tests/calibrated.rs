@@ -98,6 +98,7 @@ impl Studio {
             jitter_us: 0.0,
             covariance: CalibrationCovariance::independent([0.0; 5]),
             response: PixelResponse::with_beam(places, &beam).unwrap(),
+            drawing: None,
             white_dn: Array2::from_shape_fn(size, |(t, s)| self.white_dn(t, s) as f32),
             curve: None,
             noise: NoiseModel { read_variance: 6e-5, gain: 2.4e-4 },

@@ -201,9 +201,10 @@ fn sessions_of_earlier_versions_have_fewer_images_and_are_known_by_them() {
     let stored = |contents| CalibrationTask::stored(&plan, own.clone(), &known, contents);
     let now = CalibrationTask::new(&plan, own.clone(), &known).contents();
     let Contents::Board { images, capped } = now else { panic!("{now:?}") };
-    let passes = 3 * 8;
-    let black = 2 * own.frames as usize;
-    for fewer in [0, passes, passes + black] {
+    let columns = 2 * 7;
+    let passes = columns + 3 * 8;
+    let black = passes + 2 * own.frames as usize;
+    for fewer in [0, columns, passes, black] {
         let contents = Contents::Board { images: images - fewer, capped };
         assert_eq!(stored(contents).contents(), contents);
     }

@@ -36,7 +36,7 @@ pub use mirror::{
     MAX_POINTS, MechanicalDeg, Mirror, MirrorCapabilities, MirrorLimits, MirrorPath, MirrorPoint,
     MirrorProgress, OpticalDeg, PathError, RasterScan, SecondOrder, Tilt,
 };
-pub use pattern::{Pattern, PatternError, PatternLines};
+pub use pattern::{PROJECTOR_COLUMNS, Pattern, PatternError, PatternLines};
 pub use pixel::{Mosaic, Packing, PixelError, PixelFormat, UnknownPixelFormat, UnpackLevel};
 pub use raster::{Raster, Trigger};
 pub use subject::Subject;

@@ -4,6 +4,9 @@ use std::f64::consts::TAU;
 use std::fmt;
 use std::path::PathBuf;
 
+/// Columns of the pictures that raster projectors draw: 720p.
+pub const PROJECTOR_COLUMNS: usize = 1280;
+
 /// Most steps by which a checkerboard is shifted by the side of a square.
 const MOST_STEPS: u32 = 32;
 

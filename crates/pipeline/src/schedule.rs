@@ -4,8 +4,8 @@ use std::sync::Arc;
 
 use ndarray::{Array2, Axis};
 use raysweep_core::{CameraSettings, Raster, Shutter};
-use raysweep_transport::plane::board::{BoardCalibration, CameraCurve};
-use raysweep_transport::plane::calibrate::{self, FlyingSpot};
+use raysweep_transport::plane::board::{BoardCalibration, CameraCurve, RowDrawing};
+use raysweep_transport::plane::calibrate::{FlyingSpot, Scan};
 use raysweep_transport::plane::{Beam, CameraRows, PlaneError, RowTiming, Setting};
 use serde::Deserialize;
 
@@ -151,10 +151,19 @@ impl SweepGeometry {
         raster.first_row_us += first_light_us - raster.row_centre_us(first_row);
         let mut white_dn: Vec<f32> = calibration.white_dn.iter().copied().filter(|dn| *dn > 0.0).collect();
         white_dn.sort_by(f32::total_cmp);
+        let spot = match &calibration.drawing {
+            None => self.spot,
+            Some(RowDrawing::Even) => Spot::Uniform,
+            Some(RowDrawing::Spot(FlyingSpot { scan: Scan::OneWay, .. })) => Spot::Flying(SpotScan::OneWay),
+            Some(RowDrawing::Spot(FlyingSpot { scan: Scan::Bidirectional, .. })) => {
+                Spot::Flying(SpotScan::Bidirectional)
+            }
+        };
         Self {
             raster,
             row_table_us: None,
             beam_sigma_rows: None,
+            spot,
             first_row,
             camera_row_time_us,
             white_dn: white_dn.get(white_dn.len() / 2).map_or(self.white_dn, |&dn| f64::from(dn)),
@@ -229,21 +238,19 @@ impl SweepGeometry {
         }
     }
 
-    /// The path of a flying spot over the camera's columns, if the rig file gives it.
-    pub fn flying_spot(&self) -> Option<FlyingSpot> {
+    /// The path of a flying spot over the scene, if the rig file gives it and an ideal beam, which the model requires. A
+    /// calibration knows the path over the board alone.
+    pub fn modelled_spot(&self) -> Option<FlyingSpot> {
         let scan = match self.spot {
             Spot::Uniform | Spot::Flying(SpotScan::Unknown) => return None,
-            Spot::Flying(SpotScan::OneWay) => calibrate::Scan::OneWay,
-            Spot::Flying(SpotScan::Bidirectional) => calibrate::Scan::Bidirectional,
+            Spot::Flying(SpotScan::OneWay) => Scan::OneWay,
+            Spot::Flying(SpotScan::Bidirectional) => Scan::Bidirectional,
         };
-        let [left, right] = self.projector_columns?;
-        let column = |s: usize| left + (right - left) * (s as f64 + 0.5) / self.width as f64;
-        Some(FlyingSpot { scan, columns: (0..self.width).map(column).collect() })
-    }
-
-    /// The same, but only with an ideal beam, which the model requires.
-    pub fn modelled_spot(&self) -> Option<FlyingSpot> {
-        self.flying_spot().filter(|_| self.beam_sigma_rows == Some(0.0))
+        let is_ideal = self.calibration.is_none() && self.beam_sigma_rows == Some(0.0);
+        let [left, right] = self.projector_columns.filter(|_| is_ideal)?;
+        let column = |s: usize| (left + (right - left) * (s as f64 + 0.5) / self.width as f64) as f32;
+        let columns = Array2::from_shape_fn((1, self.width), |(_, s)| column(s));
+        Some(FlyingSpot { scan, columns })
     }
 
     /// The configuration for a point on a camera with this trigger latency.

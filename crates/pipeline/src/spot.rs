@@ -1,6 +1,7 @@
 //! A flying spot passes a pixel's column at some moment of its row's time: what becomes of images whose exposure begins
 //! or ends while it draws the row that lights the pixel directly.
 
+use raysweep_transport::plane::board::CalibrationParameter;
 use raysweep_transport::plane::calibrate::{FlyingSpot, settings_on_direct_row};
 use raysweep_transport::plane::{Demux, PlaneError, RowTiming, Setting};
 
@@ -39,7 +40,11 @@ impl SpotCut {
         settings: &[Setting],
     ) -> Result<Self, PlaneError> {
         let Spot::Flying(_) = geometry.spot else { return Ok(Self::Nowhere) };
-        let cut = settings_on_direct_row(timing, settings, 0.0)?;
+        // What may be wrong with the times of edges, on either side.
+        let unknown_us = geometry.calibration.as_ref().map_or(0.0, |calibration| {
+            calibration.jitter_us + calibration.covariance.sd(CalibrationParameter::Latency)
+        });
+        let cut = settings_on_direct_row(timing, settings, 2.0 * unknown_us)?;
         Ok(match geometry.modelled_spot() {
             _ if cut.is_empty() => Self::Nowhere,
             _ if cut.len() == settings.len() => Self::Everywhere,

@@ -129,6 +129,9 @@ fn header(header: &CalibrationHeader) -> String {
         valid_for.projector_rows,
         end.saturating_sub(1),
     );
+    if let Some(drawing) = &header.drawing {
+        text += &format!("rows       {}\n", drawing.text());
+    }
     for (name, pair) in figures(header) {
         // Writing to a string does not fail.
         let _ = writeln!(text, "{name:NAME_WIDTH$} {}", with_error(pair));

@@ -47,7 +47,7 @@ pub trait Searched: Clone + Sync {
 pub enum NoAdvice {
     /// Nothing is left to demultiplex.
     #[error(
-        "the errors cannot be predicted: every setting saturates a white pixel, or begins or ends while a flying spot draws the direct row; lower camera.white_dn (gain, aperture) or move the delays by a row"
+        "the errors cannot be predicted: every setting saturates a white pixel, or begins or ends while a flying spot draws the direct row; lower camera.white_dn (gain, aperture) or move the delays by a few rows"
     )]
     NothingUsable,
     /// The prediction would take too long.

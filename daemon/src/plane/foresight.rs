@@ -102,7 +102,7 @@ impl Model {
     }
 
     fn spot_warning(&self, task: &PlaneTask) -> Option<String> {
-        let begin_or_end = "begin or end while the flying spot draws the pixel's own row";
+        let begin_or_end = "begin or end while the flying spot draws the rows of direct light";
         match &self.cut {
             SpotCut::Nowhere | SpotCut::Modelled { .. } => None,
             SpotCut::LeftOut { cut } => {
@@ -114,13 +114,13 @@ impl Model {
                     }
                 };
                 Some(format!(
-                    "{} of {} settings {begin_or_end}, and are left out: {known}move their delays by a row",
+                    "{} of {} settings {begin_or_end}, and are left out: {known}move their delays by a few rows",
                     cut.len(),
                     task.settings().count()
                 ))
             }
             SpotCut::Everywhere => Some(format!(
-                "all settings {begin_or_end}, so direct light is not to be trusted: move the delays by a row"
+                "all settings {begin_or_end}, so direct light is not to be trusted: move the delays by a few rows"
             )),
         }
     }

@@ -272,6 +272,7 @@ mod tests {
             jitter_us: 0.0,
             covariance: CalibrationCovariance::independent([0.0; 5]),
             response: PixelResponse::with_beam(places, &shares).unwrap(),
+            drawing: None,
             white_dn,
             curve: Some(CameraCurve { per_dn: 1e-5, zero_dn: Array2::from_elem((HEIGHT, WIDTH), 100.0) }),
             noise: NoiseModel { read_variance: 0.0, gain: 0.0 },

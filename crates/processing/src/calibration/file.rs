@@ -14,8 +14,9 @@ use raysweep_session::{durable, input};
 use raysweep_transport::plane::board::images::MOST_BEND;
 use raysweep_transport::plane::board::{
     BoardCalibration, BoardStrip, CalibrationCovariance, CalibrationParameter, CameraCurve, Estimate,
-    FlickeringLamp,
+    FlickeringLamp, RowDrawing,
 };
+use raysweep_transport::plane::calibrate::{FlyingSpot, Scan};
 use raysweep_transport::plane::{NoiseModel, PixelResponse, RESPONSE_ROWS};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -33,10 +34,11 @@ const OTHER_BYTES: u64 = 4 << 20;
 /// Most modes of the covariance of the row starts.
 const MAX_MODES: u64 = 256;
 /// 4-byte numbers per pixel: place, its deviation, responses, white, its deviation, dark offset, slope and covariance,
-/// the room's light.
-const NUMBERS_PER_PX: u64 = 2 + RESPONSE_ROWS as u64 + 2 + 2 + 3 + 1;
-/// Name of the only array that older files lack.
+/// the room's light, projector column.
+const NUMBERS_PER_PX: u64 = 2 + RESPONSE_ROWS as u64 + 2 + 2 + 3 + 1 + 1;
+/// Names of the arrays that older files lack.
 const AMBIENT: &str = "ambient_dn_per_us";
+const PROJECTOR_COLUMNS: &str = "projector_columns";
 
 /// Folder of the calibration in use, within the daemon's data folder.
 pub fn current_in(data: &Path) -> PathBuf {
@@ -64,11 +66,80 @@ pub struct CalibrationHeader {
     pub timing: CalibratedTiming,
     /// Light and sensor.
     pub light: CalibratedLight,
+    /// How the projector draws a row; `None` in files of earlier versions, which leave it to the rig file.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub drawing: Option<CalibratedDrawing>,
     /// The room's light; `None` if it was not measured.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ambient: Option<CalibratedAmbient>,
     /// Figures of the calibration's own checks, each with its limit.
     pub checks: BTreeMap<String, Pair>,
+}
+
+/// How the projector draws its rows.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CalibratedDrawing {
+    /// How it draws a row.
+    pub rows: Scanning,
+    /// Projector columns at which the left and right edges of the image see the board, in 0..=1 over the projector's
+    /// width; measured if a spot flies.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub columns: Option<[f64; 2]>,
+}
+
+/// How a projector draws a row.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Scanning {
+    /// The whole row is lit at once, evenly over its time.
+    Uniform,
+    /// By a spot that flies along every row from the first column to the last.
+    OneWay,
+    /// By a spot that flies along odd rows from the last column to the first.
+    Bidirectional,
+}
+
+impl CalibratedDrawing {
+    /// That of a spot, or of rows that are lit evenly.
+    pub(super) fn of(spot: Option<&FlyingSpot>) -> Self {
+        let Some(FlyingSpot { scan, columns }) = spot else {
+            return Self { rows: Scanning::Uniform, columns: None };
+        };
+        let edges = columns.rows().into_iter().filter_map(|row| {
+            let mut seen = row.iter().copied().filter(|column| column.is_finite());
+            let first = seen.next()?;
+            Some([first, seen.next_back().unwrap_or(first)])
+        });
+        let edges: Vec<[f32; 2]> = edges.collect();
+        let rows = match scan {
+            Scan::OneWay => Scanning::OneWay,
+            Scan::Bidirectional => Scanning::Bidirectional,
+        };
+        Self { rows, columns: Some([0, 1].map(|edge| median(edges.iter().map(|edges| edges[edge])))) }
+    }
+
+    /// The direction of the spot, if one draws the rows.
+    fn scan(&self) -> Option<Scan> {
+        match self.rows {
+            Scanning::Uniform => None,
+            Scanning::OneWay => Some(Scan::OneWay),
+            Scanning::Bidirectional => Some(Scan::Bidirectional),
+        }
+    }
+
+    /// In words.
+    pub fn text(&self) -> String {
+        let rows = match self.rows {
+            Scanning::Uniform => "lit evenly over their time",
+            Scanning::OneWay => "drawn by a flying spot, all in one direction",
+            Scanning::Bidirectional => "drawn by a flying spot, odd rows backwards",
+        };
+        let seen = self.columns.map(|[left, right]| {
+            format!("; the board is seen at columns {left:.3} to {right:.3} of the width")
+        });
+        format!("{rows}{}", seen.unwrap_or_default())
+    }
 }
 
 /// The devices that a calibration belongs to.
@@ -181,6 +252,9 @@ pub struct CalibrationArrays {
     pub dark_slope_dn_per_us: Array2<f32>,
     /// Variance of the offset, covariance, variance of the slope, `[3, t, s]`.
     pub dark_covariance: Array3<f32>,
+    /// Projector column that each pixel sees of the board, `[t, s]` in 0..=1 over its width; NaN where the board was not
+    /// lit; `None` if rows are lit evenly.
+    pub projector_columns: Option<Array2<f32>>,
     /// Light of the room, `[t, s]`; `None` if it was not measured.
     pub ambient_dn_per_us: Option<Array2<f32>>,
 }
@@ -211,7 +285,7 @@ impl CalibrationArrays {
             npz.add_array("dark_offset_dn", &self.dark_offset_dn)?;
             npz.add_array("dark_slope_dn_per_us", &self.dark_slope_dn_per_us)?;
             npz.add_array("dark_covariance", &self.dark_covariance)?;
-            self.ambient_dn_per_us.as_ref().map_or(Ok(()), |level| npz.add_array(AMBIENT, level))
+            self.later().try_for_each(|(name, array)| npz.add_array(name, array))
         };
         write().map_err(|error: ndarray_npy::WriteNpzError| error.to_string())?;
         Ok(npz.finish().map_err(|error| error.to_string())?.into_inner())
@@ -223,7 +297,8 @@ impl CalibrationArrays {
     /// When an array is missing or cannot be read.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, ndarray_npy::ReadNpzError> {
         let mut npz = NpzReader::new(Cursor::new(bytes))?;
-        let has_ambient = npz.names()?.iter().any(|name| name == AMBIENT);
+        let names = npz.names()?;
+        let has = |name: &str| names.iter().any(|own| own == name);
         Ok(Self {
             row_starts_us: npz.by_name("row_starts_us")?,
             row_starts_modes: npz.by_name("row_starts_modes")?,
@@ -235,8 +310,15 @@ impl CalibrationArrays {
             dark_offset_dn: npz.by_name("dark_offset_dn")?,
             dark_slope_dn_per_us: npz.by_name("dark_slope_dn_per_us")?,
             dark_covariance: npz.by_name("dark_covariance")?,
-            ambient_dn_per_us: has_ambient.then(|| npz.by_name(AMBIENT)).transpose()?,
+            projector_columns: has(PROJECTOR_COLUMNS).then(|| npz.by_name(PROJECTOR_COLUMNS)).transpose()?,
+            ambient_dn_per_us: has(AMBIENT).then(|| npz.by_name(AMBIENT)).transpose()?,
         })
+    }
+
+    /// Those of the arrays that older files lack that there are.
+    fn later(&self) -> impl Iterator<Item = (&'static str, &Array2<f32>)> {
+        let arrays = [(AMBIENT, &self.ambient_dn_per_us), (PROJECTOR_COLUMNS, &self.projector_columns)];
+        arrays.into_iter().filter_map(|(name, array)| Some((name, array.as_ref()?)))
     }
 
     /// Checks that all arrays belong to one rig.
@@ -255,11 +337,21 @@ impl CalibrationArrays {
             ("dark_slope_dn_per_us", self.dark_slope_dn_per_us.shape(), &image),
             ("dark_covariance", self.dark_covariance.shape(), &[3, rows, columns]),
         ];
-        let ambient = self.ambient_dn_per_us.iter().map(|level| (AMBIENT, level.shape(), &image[..]));
-        for (name, found, expected) in shapes.into_iter().chain(ambient) {
+        let later = self.later().map(|(name, array)| (name, array.shape(), &image[..]));
+        for (name, found, expected) in shapes.into_iter().chain(later) {
             if found != expected {
                 return Err(format!("{name} has shape {found:?}, but valid_for says {expected:?}"));
             }
+        }
+        let spot = header.drawing.as_ref().and_then(CalibratedDrawing::scan);
+        if spot.is_some() && self.projector_columns.is_none() {
+            return Err(format!("{PROJECTOR_COLUMNS} is missing, without which a flying spot has no times"));
+        }
+        let is_column = |column: &f32| column.is_nan() || (0.0..=1.0).contains(column);
+        if let Some(column) = self.projector_columns.iter().flatten().find(|column| !is_column(column)) {
+            return Err(format!(
+                "{PROJECTOR_COLUMNS} has {column}: must be from 0 to 1, or NaN where the board was not lit"
+            ));
         }
         Ok(())
     }
@@ -389,6 +481,7 @@ impl KeptCalibration {
             jitter_us: jitter_us[0],
             covariance: self.covariance(),
             response,
+            drawing: self.drawing(),
             white_dn: self.arrays.white_dn.clone(),
             curve: self
                 .header
@@ -399,6 +492,15 @@ impl KeptCalibration {
             strip,
             lamp: self.header.ambient.as_ref().and_then(CalibratedAmbient::lamp),
         }))
+    }
+
+    /// How the projector draws a row, if it was measured.
+    fn drawing(&self) -> Option<RowDrawing> {
+        let spot = |scan| {
+            let columns = self.arrays.projector_columns.clone()?;
+            Some(RowDrawing::Spot(FlyingSpot { scan, columns }))
+        };
+        self.header.drawing.as_ref()?.scan().map_or(Some(RowDrawing::Even), spot)
     }
 
     /// Covariance of what a run takes from the calibration, for a typical pixel.
@@ -475,8 +577,12 @@ impl CalibrationHeader {
         Ok(Some(header))
     }
 
-    /// Checks that the rows seen exist, and that the curve is one that is accepted.
+    /// Checks that the rows and columns seen exist, and that the curve is one that is accepted.
     fn check(&self) -> Result<(), String> {
+        let columns = self.drawing.as_ref().and_then(|drawing| drawing.columns);
+        if let Some(column) = columns.iter().flatten().find(|column| !(0.0..=1.0).contains(*column)) {
+            return Err(format!("drawing.columns has {column}: must be from 0 to 1"));
+        }
         let rows = self.valid_for.projector_rows;
         let [first, end] = self.timing.seen_rows;
         if first >= end || end > rows {

@@ -3,19 +3,22 @@
 use std::collections::BTreeMap;
 
 use ndarray::{Array2, Array3, Axis};
-use raysweep_core::Shutter;
+use raysweep_core::{PROJECTOR_COLUMNS, Shutter};
 use raysweep_session::ledger::{FrameStarts, PointEntry, State};
 use raysweep_session::stack::{Stack, crc32};
 use raysweep_transport::plane::board::Estimate;
 use raysweep_transport::plane::board::images::{
     Ambient, BlackFrames, CappedFrames, CodedPictures, DarkFit, ImagesError, LightLevel, Linearity, Phases,
-    PhotonTransfer, Responses, RowPlaces, SensorNoise, WhiteMap, ambient, locate_rows, photon_transfer, prnu,
-    steady,
+    PhotonTransfer, Responses, RowPlaces, SensorNoise, WhiteMap, ambient, locate_columns, locate_rows,
+    photon_transfer, prnu, steady,
 };
 use raysweep_transport::plane::board::times::{BoardFrame, CoarseSweep, Columns, RowTimes, TimesError};
+use raysweep_transport::plane::calibrate::FlyingSpot;
 use raysweep_transport::plane::{NoiseModel, PlaneError};
 
-use super::task::{AMBIENT_US, BoardPurpose, CalibrationTask, PASSES_GREY, ROWS_PER_BLOCK, WHOLE_US};
+use super::task::{
+    AMBIENT_US, BoardPurpose, COLUMNS_PER_BLOCK, CalibrationTask, PASSES_GREY, ROWS_PER_BLOCK, WHOLE_US,
+};
 use crate::plane::place;
 
 /// Light of the room, of white in the time of a row, that is not worth subtracting.
@@ -281,13 +284,13 @@ impl BoardPixels {
         let black_dn = black.mean_axis(Axis(0)).unwrap_or_default();
         let sparse = straight(images.means(CalibrationTask::phases())?) - &black_dn;
         let phases = Phases { images: sparse.view(), frames: task.calibration.picture_frames as usize };
-        let coded = images.means(task.codes())?;
+        let coded = images.means(task.row_codes())?;
         let code = CodedPictures { images: coded.view(), lines_per_block: ROWS_PER_BLOCK };
         let projector_rows = task.task.geometry.raster.rows;
         let places = locate_rows(&phases, &code, lit.view(), projector_rows)?;
         let responses = Responses::new(&phases, &white, &places, projector_rows)?;
         responses.checks.check()?;
-        let columns = Columns::new(responses.place.view(), responses.response.view())?;
+        let columns = Columns::new(responses.place.view(), responses.response.view(), None)?;
         Ok(Self { dark, transfer, prnu, curve, white, ambient, places, responses, columns })
     }
 
@@ -341,11 +344,14 @@ impl BoardPixels {
         Ok(CoarseSweep::from_borders(&self.columns, &frames, &images.task.nominal())?)
     }
 
-    /// When each row is lit.
+    /// When each row is lit, and by which spot unless it is lit evenly.
     ///
     /// # Errors
     /// When an image is missing, or the times cannot be found.
-    pub fn times(&self, images: &BoardImages<'_>) -> Result<RowTimes, CalibrationError> {
+    pub fn times(
+        &self,
+        images: &BoardImages<'_>,
+    ) -> Result<(RowTimes, Option<FlyingSpot>), CalibrationError> {
         let mut frames = Vec::new();
         for purpose in [BoardPurpose::SweepTime, BoardPurpose::Arrival, BoardPurpose::ExposureCheck] {
             frames.extend(self.board_frames(images, purpose)?);
@@ -355,7 +361,30 @@ impl BoardPixels {
             read_variance: (noise.read_noise_e / noise.electrons_per_dn / white_dn).powi(2),
             gain: 1.0 / (noise.electrons_per_dn * white_dn),
         };
-        Ok(RowTimes::fit(&self.columns, &frames, &images.task.nominal(), share)?)
+        let nominal = images.task.nominal();
+        let uneven = match RowTimes::fit(&self.columns, &frames, &nominal, share) {
+            Err(error @ (TimesError::Misfit { .. } | TimesError::Jitter { .. })) => error,
+            other => return Ok((other?, None)),
+        };
+        let Some(columns) = self.projector_columns(images)? else { return Err(uneven.into()) };
+        let pixels = (self.responses.place.view(), self.responses.response.view());
+        match RowTimes::find_spot(pixels, columns.view(), &frames, &nominal, share)? {
+            Some((times, spot)) => Ok((times, Some(spot))),
+            None => Err(uneven.into()),
+        }
+    }
+
+    /// The projector column that each pixel with a place sees, `[t, s]` in 0..=1 over the projector's width; `None` in
+    /// sessions from before the pictures of the columns were taken.
+    fn projector_columns(&self, images: &BoardImages<'_>) -> Result<Option<Array2<f32>>, CalibrationError> {
+        let pictures: Vec<BoardPurpose> = images.task.column_codes().collect();
+        if pictures.is_empty() {
+            return Ok(None);
+        }
+        let coded = images.means(pictures.into_iter())?;
+        let code = CodedPictures { images: coded.view(), lines_per_block: COLUMNS_PER_BLOCK };
+        let has_place = self.responses.place.mapv(f32::is_finite);
+        Ok(Some(locate_columns(&code, has_place.view(), PROJECTOR_COLUMNS)?))
     }
 }
 

@@ -15,10 +15,11 @@ use raysweep_session::{Result, Session, durable};
 use raysweep_transport::plane::board::Estimate;
 use raysweep_transport::plane::board::images::MOST_BEND;
 use raysweep_transport::plane::board::times::RowTimes;
+use raysweep_transport::plane::calibrate::FlyingSpot;
 
 pub use self::file::{
-    CalibratedAmbient, CalibratedFlicker, CalibrationArrays, CalibrationHeader, KeptCalibration, Pair,
-    ValidFor, current_in,
+    CalibratedAmbient, CalibratedDrawing, CalibratedFlicker, CalibrationArrays, CalibrationHeader,
+    KeptCalibration, Pair, Scanning, ValidFor, current_in,
 };
 use self::file::{CalibratedLight, CalibratedTiming, SCHEMA};
 pub use self::images::{BoardImages, BoardPixels, CalibrationError, MeasuredCurve};
@@ -35,6 +36,8 @@ pub struct BoardFindings {
     pub pixels: BoardPixels,
     /// Of the times.
     pub times: RowTimes,
+    /// The spot that draws the rows; `None` if they are lit evenly.
+    pub spot: Option<FlyingSpot>,
 }
 
 impl BoardFindings {
@@ -44,8 +47,8 @@ impl BoardFindings {
     /// When an image is missing, or the result is not good enough to be used.
     pub fn new(images: &BoardImages<'_>) -> std::result::Result<Self, CalibrationError> {
         let pixels = BoardPixels::new(images)?;
-        let times = pixels.times(images)?;
-        Ok(Self { pixels, times })
+        let (times, spot) = pixels.times(images)?;
+        Ok(Self { pixels, times, spot })
     }
 
     /// What is worth knowing about a result that is good enough.
@@ -68,7 +71,7 @@ impl BoardFindings {
     /// # Errors
     /// When it cannot be encoded.
     pub fn keep(&self, session: &Session, state: &State, valid_for: ValidFor) -> Result<KeptCalibration> {
-        let Self { pixels, times } = self;
+        let Self { pixels, times, spot } = self;
         let name = session.dir().file_name().unwrap_or(session.dir().as_os_str());
         let header = CalibrationHeader {
             schema: SCHEMA,
@@ -94,6 +97,7 @@ impl BoardFindings {
                 hot_pixels: pixels.dark.hot.iter().filter(|hot| **hot).count(),
                 response_width_sd: Some(pixels.responses.width_sd()),
             },
+            drawing: Some(CalibratedDrawing::of(spot.as_ref())),
             ambient: self.ambient(),
             checks: self.checks(),
         };
@@ -124,6 +128,7 @@ impl BoardFindings {
             dark_offset_dn: pixels.dark.offset_dn.clone(),
             dark_slope_dn_per_us: pixels.dark.slope_dn_per_us.clone(),
             dark_covariance: pixels.dark.covariance.clone(),
+            projector_columns: spot.as_ref().map(|spot| spot.columns.clone()),
             ambient_dn_per_us: pixels.ambient.as_ref().map(|(ambient, _)| ambient.level_dn_per_us.clone()),
         };
         KeptCalibration::new(header, arrays)
@@ -131,7 +136,7 @@ impl BoardFindings {
 
     /// The room's light, in the form in which it is kept.
     fn ambient(&self) -> Option<CalibratedAmbient> {
-        let Self { pixels, times } = self;
+        let Self { pixels, times, .. } = self;
         let (ambient, _) = pixels.ambient.as_ref()?;
         let white_dn = pixels.white.level_dn.value;
         let flicker = ambient.flicker.as_ref().map(|flicker| CalibratedFlicker {

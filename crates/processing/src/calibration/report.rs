@@ -34,7 +34,10 @@ pub(super) fn make(
         let notes = warnings.into_iter().map(|warning| Block::Note(NoteLevel::Warning, warning));
         sections.push(section("Warnings", "", notes.collect()));
     }
-    sections.push(section("Found", "Each with its standard deviation.", vec![found(findings)]));
+    let drawing = kept.header.drawing.as_ref();
+    let drawing = drawing.map(|drawing| Block::Note(NoteLevel::Info, format!("rows: {}", drawing.text())));
+    let blocks = [found(findings)].into_iter().chain(drawing).collect();
+    sections.push(section("Found", "Each with its standard deviation.", blocks));
     sections.push(times(task, findings));
     sections.push(responses(findings));
     sections.push(pixels(findings));

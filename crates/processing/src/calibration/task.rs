@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use raysweep_config::Plan;
 use raysweep_config::plan::CalibrationPlan;
-use raysweep_core::{Pattern, Raster, Shutter, Subject};
+use raysweep_core::{PROJECTOR_COLUMNS, Pattern, Raster, Shutter, Subject};
 use raysweep_pipeline::{Point, PointRole, Schedule};
 use raysweep_session::ledger::PointEntry;
 use raysweep_session::stack::Contents;
@@ -35,6 +35,8 @@ pub enum BoardPurpose {
     Rows(usize),
     /// The board under a picture of the rows' Gray code: the highest bit first, each followed by its inverse.
     RowCode(usize),
+    /// The same of the columns' Gray code.
+    ColumnCode(usize),
     /// The white board with a global shutter: when the rows are lit.
     SweepTime,
     /// The white board in exposures of three rows: when each row's light arrives.
@@ -62,6 +64,8 @@ const PASSES_FRAMES: usize = 8;
 const PHASES: usize = 16;
 /// Rows with the same Gray code.
 pub(super) const ROWS_PER_BLOCK: usize = 8;
+/// Columns with the same Gray code.
+pub(super) const COLUMNS_PER_BLOCK: usize = 16;
 /// Exposure that contains all light of a pixel.
 pub(super) const WHOLE_US: f64 = 3600.0;
 /// Exposure of the shorter images of the room's light.
@@ -96,8 +100,8 @@ impl CalibrationTask {
         Self::with_purposes(plan, calibration, known, purposes)
     }
 
-    /// The calibration of a session with these contents, which may be from before the camera's linearity was measured,
-    /// or the room's light.
+    /// The calibration of a session with these contents, which may be from before the columns were measured, the camera's
+    /// linearity or the room's light.
     pub fn stored(
         plan: &Plan,
         calibration: CalibrationPlan,
@@ -108,12 +112,16 @@ impl CalibrationTask {
         if task.contents() == contents {
             return task;
         }
-        let before_passes = CalibrationPlan { passes: 0, ..calibration };
-        let purposes = purposes(&before_passes, known.file.projector.rows);
-        let earlier = [false, true].map(|has_ambient| {
-            let has = |purpose: &BoardPurpose| has_ambient || *purpose != BoardPurpose::Ambient;
-            let purposes = purposes.iter().copied().filter(has).collect();
-            Self::with_purposes(plan, before_passes.clone(), known, purposes)
+        let before_passes = CalibrationPlan { passes: 0, ..calibration.clone() };
+        let earlier = [(calibration, true), (before_passes.clone(), true), (before_passes, false)];
+        let earlier = earlier.map(|(calibration, has_ambient)| {
+            let mut purposes = purposes(&calibration, known.file.projector.rows);
+            purposes.retain(|purpose| match purpose {
+                BoardPurpose::ColumnCode(_) => false,
+                BoardPurpose::Ambient => has_ambient,
+                _ => true,
+            });
+            Self::with_purposes(plan, calibration, known, purposes)
         });
         earlier.into_iter().find(|earlier| earlier.contents() == contents).unwrap_or(task)
     }
@@ -145,7 +153,8 @@ impl CalibrationTask {
                 BoardPurpose::Black
                 | BoardPurpose::White
                 | BoardPurpose::Grey(_)
-                | BoardPurpose::RowCode(_) => (WHOLE_US, 1),
+                | BoardPurpose::RowCode(_)
+                | BoardPurpose::ColumnCode(_) => (WHOLE_US, 1),
             };
             let delay_us = match purpose {
                 BoardPurpose::SweepTime | BoardPurpose::Arrival | BoardPurpose::ExposureCheck => 0.0,
@@ -190,9 +199,14 @@ impl CalibrationTask {
             BoardPurpose::Passes(_) => Pattern::Grey { level: PASSES_GREY },
             BoardPurpose::Rows(phase) => Pattern::SparseRows { phase, period: PHASES },
             BoardPurpose::RowCode(picture) => Pattern::GrayRows {
-                bit: code_bits(self.task.geometry.raster.rows) - 1 - picture as u32 / 2,
+                bit: row_bits(self.task.geometry.raster.rows) - 1 - picture as u32 / 2,
                 inverse: picture % 2 == 1,
                 block: ROWS_PER_BLOCK,
+            },
+            BoardPurpose::ColumnCode(picture) => Pattern::GrayColumns {
+                bit: column_bits() - 1 - picture as u32 / 2,
+                inverse: picture % 2 == 1,
+                block: COLUMNS_PER_BLOCK,
             },
             BoardPurpose::White
             | BoardPurpose::SweepTime
@@ -223,8 +237,13 @@ impl CalibrationTask {
     }
 
     /// The purposes of the pictures of the rows' Gray code.
-    pub(super) fn codes(&self) -> impl Iterator<Item = BoardPurpose> + use<> {
-        (0..2 * code_bits(self.task.geometry.raster.rows) as usize).map(BoardPurpose::RowCode)
+    pub(super) fn row_codes(&self) -> impl Iterator<Item = BoardPurpose> + use<> {
+        (0..2 * row_bits(self.task.geometry.raster.rows) as usize).map(BoardPurpose::RowCode)
+    }
+
+    /// Those of the pictures of the columns' Gray code; empty for a session from before they were taken.
+    pub(super) fn column_codes(&self) -> impl Iterator<Item = BoardPurpose> {
+        self.purposes.iter().copied().filter(|purpose| matches!(purpose, BoardPurpose::ColumnCode(_)))
     }
 
     /// What the rig file says of the times.
@@ -304,9 +323,17 @@ fn start_us(raster: &Raster, first_row: usize, delay_us: f64, exposure_us: f64) 
 }
 
 /// Bits of the Gray code of all blocks of rows.
-fn code_bits(projector_rows: usize) -> u32 {
-    let blocks = projector_rows.div_ceil(ROWS_PER_BLOCK).max(2);
-    usize::BITS - (blocks - 1).leading_zeros()
+fn row_bits(projector_rows: usize) -> u32 {
+    code_bits(projector_rows.div_ceil(ROWS_PER_BLOCK))
+}
+
+/// Those of all blocks of columns.
+fn column_bits() -> u32 {
+    code_bits(PROJECTOR_COLUMNS.div_ceil(COLUMNS_PER_BLOCK))
+}
+
+fn code_bits(blocks: usize) -> u32 {
+    usize::BITS - (blocks.max(2) - 1).leading_zeros()
 }
 
 /// The purposes of all points, in the order of acquisition.
@@ -320,13 +347,15 @@ fn purposes(plan: &CalibrationPlan, projector_rows: usize) -> Vec<BoardPurpose> 
     let greys = (0..GREYS.len()).flat_map(|grey| several(BoardPurpose::Grey(grey), GREY_FRAMES));
     let passes =
         (1..=plan.passes as usize).flat_map(|passes| several(BoardPurpose::Passes(passes), PASSES_FRAMES));
-    let codes = 2 * code_bits(projector_rows) as usize;
+    let row_codes = 2 * row_bits(projector_rows) as usize;
+    let column_codes = 2 * column_bits() as usize;
     capped
         .chain(levels.into_iter().flatten())
         .chain(greys)
         .chain(passes)
         .chain((0..PHASES).map(BoardPurpose::Rows))
-        .chain((0..codes).map(BoardPurpose::RowCode))
+        .chain((0..row_codes).map(BoardPurpose::RowCode))
+        .chain((0..column_codes).map(BoardPurpose::ColumnCode))
         .chain(several(BoardPurpose::SweepTime, SWEEP_TIMES))
         .chain(several(BoardPurpose::Arrival, ARRIVAL_FRAMES * plan.delays as usize))
         .chain(several(BoardPurpose::ExposureCheck, EXPOSURE_CHECKS))

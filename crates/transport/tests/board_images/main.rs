@@ -400,7 +400,6 @@ fn columns_are_located_with_blocks_of_16() {
     let mut scene = Scene::new((128, 128), 600.4, 0.3, Cumulative::new(FLAT_TOP, 0.0), 4);
     scene.projector_rows = 1280;
     scene.brightness = vec![1.0; 1280];
-    let pictures = scene.pictures(2, 4);
     let code: Vec<Array2<f32>> = (0..14)
         .map(|n| {
             let gray = |v: usize| ((v / 16) ^ (v / 32)) >> (6 - n / 2) & 1;
@@ -412,18 +411,16 @@ fn columns_are_located_with_blocks_of_16() {
     let code = ndarray::stack(Axis(0), &views).unwrap();
     let code =
         raysweep_transport::plane::board::images::CodedPictures { images: code.view(), lines_per_block: 16 };
-    let mut phases = pictures.phases();
-    phases.images.swap_axes(1, 2);
     let lit = Array2::from_elem((128, 128), true);
-    let columns = locate_columns(&phases, &code, lit.view(), 1280).unwrap();
+    let columns = locate_columns(&code, lit.view(), 1280).unwrap();
     for ((t, s), column) in columns.indexed_iter() {
         let truth = (scene.place(s, t) + 0.5) / 1280.0;
-        assert!((f64::from(*column) - truth).abs() * 1280.0 < 0.08, "{t} {s}: {column} {truth}");
+        assert!((f64::from(*column) - truth).abs() * 1280.0 < 3.2, "{t} {s}: {column} {truth}");
     }
     // 6 bits name 64 blocks of 16 columns, but there are 80.
     let mut short = code;
     short.images = code.images.slice_move(ndarray::s![2.., .., ..]);
-    assert!(matches!(locate_columns(&phases, &short, lit.view(), 1280), Err(ImagesError::OutOfRange { .. })));
+    assert!(matches!(locate_columns(&short, lit.view(), 1280), Err(ImagesError::OutOfRange { .. })));
 }
 
 #[test]

@@ -169,7 +169,7 @@ impl Measurement for CalibrationRun {
             let stack = session.stack()?;
             let images = BoardImages { task: &calibration, state: ledger.state(), stack: &stack };
             match pixels.times(&images) {
-                Ok(times) => found = Some(BoardFindings { pixels, times }),
+                Ok((times, spot)) => found = Some(BoardFindings { pixels, times, spot }),
                 Err(error) => fault = Some(error.into()),
             }
         }

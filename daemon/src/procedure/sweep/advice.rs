@@ -128,6 +128,7 @@ mod tests {
             covariance: CalibrationCovariance::independent([0.0; 5]),
             response: PixelResponse::with_beam(Array2::from_shape_fn((720, 16), |(t, _)| t as f32), &shares)
                 .unwrap(),
+            drawing: None,
             white_dn: Array2::from_elem((720, 16), 2500.0),
             curve: None,
             noise: NoiseModel { read_variance: 0.04, gain: 0.09 },

@@ -3,6 +3,7 @@ use std::ops::Range;
 use ndarray::{Array2, s};
 
 use super::super::error::check_shape;
+use super::super::model::FlyingSpot;
 use super::super::{CameraRows, FIRST_RESPONSE_ROW, NoiseModel, PixelResponse, PlaneError, RowTiming};
 use super::{CalibrationCovariance, Estimate};
 
@@ -23,6 +24,8 @@ pub struct BoardCalibration {
     pub covariance: CalibrationCovariance,
     /// Where each pixel looks and how rows share its direct light. `[t, s]` are the camera's rows and columns.
     pub response: PixelResponse,
+    /// How the projector draws a row; `None` if it was not measured.
+    pub drawing: Option<RowDrawing>,
     /// Counts above black that a pixel collects in one pass of a white picture, `[t, s]`; NaN where the board was not
     /// lit.
     pub white_dn: Array2<f32>,
@@ -34,6 +37,15 @@ pub struct BoardCalibration {
     pub strip: Option<BoardStrip>,
     /// A lamp that flickered in the room; `None` if none did, or it was not measured.
     pub lamp: Option<FlickeringLamp>,
+}
+
+/// How a projector draws a row.
+#[derive(Debug, Clone, PartialEq)]
+pub enum RowDrawing {
+    /// The whole row is lit at once, evenly over its time.
+    Even,
+    /// By a spot, with the columns at which pixels see the board. A scene at another distance is seen at others.
+    Spot(FlyingSpot),
 }
 
 /// The curve of a camera: `DN (1 + a DN)` is proportional to the light, DN counting from an exposure of 0.

@@ -1,7 +1,8 @@
-use ndarray::ArrayView1;
+use ndarray::{Array2, ArrayView1, s};
 
 use super::super::PlaneError;
-use super::{RowTiming, Setting};
+use super::super::error::check_shape;
+use super::{FIRST_RESPONSE_ROW, RESPONSE_ROWS, RowTiming, Setting};
 
 /// The direction in which a flying spot draws its rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -17,17 +18,41 @@ pub enum Scan {
 pub struct FlyingSpot {
     /// The direction of its rows.
     pub scan: Scan,
-    /// The projector column that each camera column sees, in 0..=1 over the projector's width.
-    pub columns: Vec<f64>,
+    /// The projector column that each pixel sees, `[t, s]`, in 0..=1 over the projector's width; one row stands for
+    /// all. NaN where it is unknown.
+    pub columns: Array2<f32>,
 }
 
+/// Rows that send less of a pixel's direct light may be cut by the edge of an exposure.
+const LEAST_SHARE: f32 = 0.02;
 /// Number of distinguished parts of the projector's width; more would cost more time than they reduce the error.
 const SPOT_PARTS: usize = 64;
 
 impl FlyingSpot {
-    /// The part of the projector's width that a camera column sees.
-    pub(in super::super) fn part(&self, column: usize) -> usize {
-        ((self.columns[column] * SPOT_PARTS as f64) as usize).min(SPOT_PARTS - 1)
+    /// Checks that the columns are those of an image with this number of rows and columns.
+    ///
+    /// # Errors
+    /// [`PlaneError::Shape`]; [`PlaneError::OutOfRange`] for a column outside 0..=1.
+    pub(in super::super) fn check(&self, (rows, columns): (usize, usize)) -> Result<(), PlaneError> {
+        let rows = if self.columns.nrows() == 1 { 1 } else { rows };
+        check_shape("columns of the spot", "[camera rows, columns]", self.columns.shape(), &[rows, columns])?;
+        match self.columns.iter().find(|column| !(column.is_nan() || (0.0..=1.0).contains(*column))) {
+            Some(&value) => {
+                let allowed = "from 0 to 1: divide the projector's column by its width";
+                Err(PlaneError::OutOfRange { field: "columns", value: value.into(), allowed })
+            }
+            None => Ok(()),
+        }
+    }
+
+    /// The projector column that pixel `[t, s]` sees; NaN if it is unknown.
+    pub(in super::super) fn column(&self, t: usize, s: usize) -> f64 {
+        f64::from(self.columns[[t.min(self.columns.nrows() - 1), s]])
+    }
+
+    /// The part of the projector's width that pixel `[t, s]` sees.
+    pub(in super::super) fn part(&self, t: usize, s: usize) -> usize {
+        ((self.column(t, s) * SPOT_PARTS as f64) as usize).min(SPOT_PARTS - 1)
     }
 
     /// Weights of direct light in each setting for the pixels of camera row `t` that see each part, if they differ
@@ -49,27 +74,49 @@ impl FlyingSpot {
     }
 }
 
-/// When the direct row of a camera row is drawn, relative to a delay of 0 of that camera row.
-struct DirectRow {
+/// When a row is drawn, relative to a delay of 0 of a camera row.
+struct DrawnRow {
     start_us: f64,
     dwell_us: f64,
 }
 
-impl DirectRow {
-    fn of(timing: &RowTiming, t: usize) -> Self {
-        let row = timing.camera().own_row(t);
-        let (late_us, next_late_us) = (timing.late_us(row), timing.late_us(row + 1));
+impl DrawnRow {
+    /// Row `v` of the projector, relative to camera row `t`.
+    fn at(timing: &RowTiming, t: usize, v: usize) -> Self {
+        let (late_us, next_late_us) = (timing.late_us(v), timing.late_us(v + 1));
         let row_time_us = timing.row_time_us();
+        let from_own = v as f64 - timing.camera().own_row(t) as f64;
         Self {
-            start_us: late_us - row_time_us / 2.0 - timing.exposure_shift_us(t),
+            start_us: (from_own - 0.5) * row_time_us + late_us - timing.exposure_shift_us(t),
             dwell_us: row_time_us + (next_late_us - late_us),
         }
+    }
+
+    /// The rows that send at least [`LEAST_SHARE`] of the direct light of some pixel of camera row `t`.
+    fn all(timing: &RowTiming, t: usize) -> Vec<Self> {
+        let Some(response) = timing.response() else {
+            return vec![Self::at(timing, t, timing.camera().own_row(t))];
+        };
+        let (_, columns) = response.size();
+        let (first, last) = response
+            .own_rows(t, columns)
+            .fold((i64::MAX, i64::MIN), |(first, last), own_row| (first.min(own_row), last.max(own_row)));
+        let mut sends = vec![false; (last - first) as usize + RESPONSE_ROWS];
+        let shares = response.shares();
+        for (d, shares) in shares.slice(s![.., t, ..]).rows().into_iter().enumerate() {
+            for (own_row, &share) in response.own_rows(t, columns).zip(shares) {
+                sends[(own_row - first) as usize + d] |= share >= LEAST_SHARE;
+            }
+        }
+        let first = first + i64::from(FIRST_RESPONSE_ROW);
+        let lit = (first..).zip(sends).filter_map(|(row, sends)| usize::try_from(row).ok().filter(|_| sends));
+        lit.filter(|v| *v < timing.projector_rows()).map(|v| Self::at(timing, t, v)).collect()
     }
 }
 
 /// Settings that a flying spot makes unreliable if a pixel's projector column is unknown: those with an edge within
 /// half a row time plus half the jitter of the centre of the direct row of any camera row, where the spot may or may
-/// not have passed.
+/// not have passed. With a measured response, all rows that send 2 % of some pixel's direct light are direct rows.
 /// Indices in ascending order.
 ///
 /// With a projector that lights its rows uniformly, no settings need to be dropped.
@@ -86,9 +133,9 @@ pub fn settings_on_direct_row(
         let allowed = "finite and not negative: give the spread of the measured delays, in microseconds";
         return Err(PlaneError::OutOfRange { field: "jitter_us", value: jitter_us, allowed });
     }
-    let rows: Vec<DirectRow> = (0..timing.camera_rows()).map(|t| DirectRow::of(timing, t)).collect();
+    let rows: Vec<DrawnRow> = (0..timing.camera_rows()).flat_map(|t| DrawnRow::all(timing, t)).collect();
     let period_us = timing.period_us();
-    let is_on = |row: &DirectRow, edge_us: f64| {
+    let is_on = |row: &DrawnRow, edge_us: f64| {
         // The direct row is drawn again in each period, and long exposures reach it.
         let from_centre_us = edge_us - row.start_us - row.dwell_us / 2.0;
         let distance_us = (from_centre_us - period_us * (from_centre_us / period_us).round()).abs();
@@ -126,9 +173,10 @@ pub fn spike_weights(
         let allowed = "from 0 to 1: divide the projector's column by its width";
         return Err(PlaneError::OutOfRange { field: "projector_column", value: projector_column, allowed });
     }
-    let backwards = scan == Scan::Bidirectional && timing.camera().own_row(t) % 2 == 1;
+    let own_row = timing.camera().own_row(t);
+    let backwards = scan == Scan::Bidirectional && own_row % 2 == 1;
     let column = if backwards { 1.0 - projector_column } else { projector_column };
-    let row = DirectRow::of(timing, t);
+    let row = DrawnRow::at(timing, t, own_row);
     let moment_us = row.start_us + row.dwell_us * column;
     let weight = |setting: &Setting| {
         let passes = setting.delays_us.iter().map(|delay_us| {
@@ -144,7 +192,7 @@ pub fn spike_weights(
 
 #[cfg(test)]
 mod tests {
-    use super::super::CameraRows;
+    use super::super::{CameraRows, PixelResponse};
     use super::*;
 
     fn timing() -> RowTiming {
@@ -215,5 +263,21 @@ mod tests {
         for (mean, setting) in mean.iter().zip(&settings) {
             assert!((mean - timing().weights(7, setting)[7]).abs() < 1e-3);
         }
+    }
+
+    #[test]
+    fn all_rows_that_light_a_pixel_directly_are_cut() {
+        // Camera row 7 sees row 8 by a half, 9 and 10 by a quarter each.
+        let mut shares = [0.0; RESPONSE_ROWS];
+        (shares[6], shares[7], shares[8]) = (0.5, 0.25, 0.25);
+        let places = Array2::from_shape_fn((128, 1), |(t, _)| t as f32 + 2.0);
+        let response = PixelResponse::with_beam(places, &shares).unwrap();
+        let timing = timing().with_response(response).unwrap();
+        let settings: Vec<Setting> =
+            (-60..100).map(|step| Setting::new(300.0 + f64::from(step), 600.0)).collect();
+        // They are drawn from 10 to 70 us after the middle of row 7; exposures between two of them cut none.
+        let opening = |us: i32| (us + 60) as usize;
+        let expected: Vec<usize> = (11..70).filter(|us| ![30, 50].contains(us)).map(opening).collect();
+        assert_eq!(settings_on_direct_row(&timing, &settings, 0.0), Ok(expected));
     }
 }

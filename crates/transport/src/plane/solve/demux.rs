@@ -134,7 +134,7 @@ impl Demux {
         }
         if let Some(&value) = spot.columns.iter().find(|column| !(0.0..=1.0).contains(*column)) {
             let allowed = "from 0 to 1: divide the projector's column by its width";
-            return Err(PlaneError::OutOfRange { field: "columns", value, allowed });
+            return Err(PlaneError::OutOfRange { field: "columns", value: value.into(), allowed });
         }
         Ok(Self { spot: Some(Arc::new(spot)), ..self.clone() })
     }
@@ -337,7 +337,7 @@ impl Demux {
             check_shape("u0_rows", "[camera rows, columns]", u0_rows.shape(), &expected)?;
         }
         if let Some(spot) = &self.spot {
-            check_shape("columns of the spot", "[columns]", &[spot.columns.len()], &[columns])?;
+            spot.check((self.timing.camera_rows(), columns))?;
         }
         if let Some(bracket) = &self.bracket {
             check_shape("image of the bracket", "[columns]", &[bracket.image.ncols()], &[columns])?;

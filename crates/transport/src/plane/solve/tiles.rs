@@ -275,7 +275,7 @@ impl Objectives<'_> {
         let mut by_part: BTreeMap<(i32, Option<usize>), Vec<usize>> = BTreeMap::new();
         for column in 0..row.columns {
             let u0_rows = row.u0_rows.filter(|_| own.is_some()).map_or(0.0, |u0_rows| u0_rows[column]);
-            let part = uneven.as_ref().map(|(spot, weights)| (spot.part(column), weights));
+            let part = uneven.as_ref().map(|(spot, weights)| (spot.part(row.t, column), weights));
             let part = part.and_then(|(part, weights)| weights[part].as_ref().map(|_| part));
             by_part.entry(((u0_rows * SPIKE_STEPS).round() as i32, part)).or_default().push(column);
         }

@@ -12,6 +12,8 @@ const REACH: usize = 3;
 const MOST_RMS: f64 = 0.1;
 /// Points beyond this many lines from the smooth map are misread and not counted in its difference.
 const MISREAD_LINES: f64 = 2.0;
+/// Largest accepted difference of the middles of blocks from a smooth map, in blocks: 0.29 where all is well.
+const MOST_BLOCK_RMS: f64 = 0.5;
 /// Largest number of points for the smooth map.
 const MAX_POINTS: usize = 60_000;
 /// Fewest points for the smooth map.
@@ -64,19 +66,40 @@ pub fn locate_rows(
     locate(phases, code, lit, projector_rows, "row")
 }
 
-/// The projector column that each pixel sees, in 0..1 over the projector's width, from the same pictures over
-/// columns; NaN where unlit.
+/// The projector column that each pixel sees, `[t, s]` in 0..=1 over the projector's width, from a Gray code over
+/// columns alone: a smooth map through the middles of the blocks that pixels in `lit` see, good to a fifth of a block.
+/// NaN where unlit.
 ///
 /// # Errors
-/// Those of [`locate_rows`].
+/// [`ImagesError::NotSmooth`] if pixels see blocks that differ from the map by more than half a block (rms);
+/// [`ImagesError::TooFew`] lit pixels; [`ImagesError::Shape`]; [`ImagesError::OutOfRange`] for a code that does not
+/// reach all columns.
 pub fn locate_columns(
-    phases: &Phases,
     code: &CodedPictures,
     lit: ArrayView2<bool>,
     projector_columns: usize,
 ) -> Result<Array2<f32>, ImagesError> {
-    let places = locate(phases, code, lit, projector_columns, "column")?;
-    Ok(places.place.mapv(|place| (place + 0.5) / projector_columns as f32))
+    check_code(code, lit.dim(), projector_columns)?;
+    let block_columns = code.lines_per_block as f64;
+    let points: Vec<SmoothPoint> = lit
+        .indexed_iter()
+        .filter(|(_, lit)| **lit)
+        .map(|((t, s), _)| SmoothPoint { t, s, value: (block(code, t, s) as f64 + 0.5) * block_columns })
+        .collect();
+    let map = smooth(lit.dim(), &points)?;
+    let residuals = points.iter().map(|point| (point.value - map.at(point.t, point.s)) / block_columns);
+    // A misread block counts, but no more than one that is two off.
+    let squares: f64 = residuals.map(|residual| residual.abs().min(2.0).powi(2)).sum();
+    let rms = (squares / points.len() as f64).sqrt();
+    if rms > MOST_BLOCK_RMS {
+        return Err(ImagesError::NotSmooth { lines: "block of columns", rms, limit: MOST_BLOCK_RMS });
+    }
+    let mut columns = map.image();
+    columns.zip_mut_with(&lit, |column, lit| {
+        let share = *column / projector_columns as f32;
+        *column = if *lit { share.clamp(0.0, 1.0) } else { f32::NAN };
+    });
+    Ok(columns)
 }
 
 fn locate(
@@ -97,30 +120,15 @@ fn locate(
             })
         })
         .collect();
-    let too_few = |given| ImagesError::TooFew {
-        what: "lit pixels whose line can be read",
-        given,
-        needed: MIN_POINTS,
-        cure: "fill the view with the board, and check that the pictures are shown in their order",
-    };
-    if points.len() < MIN_POINTS {
-        return Err(too_few(points.len()));
-    }
-    let fit = |points: &[SmoothPoint]| {
-        // An odd step, so that the points do not lie in a few columns only.
-        let step = (points.len() / MAX_POINTS) | 1;
-        let few: Vec<SmoothPoint> = points.iter().copied().step_by(step).collect();
-        SmoothMap::fit(shape, &few).ok_or_else(|| too_few(few.len()))
-    };
     // Where the code changes, it may be read one block off, and the place is then wrong by 16 lines.
-    let first = fit(&points)?;
+    let first = smooth(shape, &points)?;
     let mut misread = 0;
     for point in &mut points {
         let turns = ((point.value - first.at(point.t, point.s)) / PHASES as f64).round();
         point.value -= turns * PHASES as f64;
         misread += usize::from(turns != 0.0);
     }
-    let map = fit(&points)?;
+    let map = smooth(shape, &points)?;
     let mut squares = Vec::with_capacity(points.len());
     for point in &points {
         let residual = point.value - map.at(point.t, point.s);
@@ -144,6 +152,23 @@ fn locate(
     Ok(RowPlaces { place, rms, misread })
 }
 
+/// The smooth map through points.
+fn smooth(shape: (usize, usize), points: &[SmoothPoint]) -> Result<SmoothMap, ImagesError> {
+    let too_few = |given| ImagesError::TooFew {
+        what: "lit pixels whose line can be read",
+        given,
+        needed: MIN_POINTS,
+        cure: "fill the view with the board, and check that the pictures are shown in their order",
+    };
+    if points.len() < MIN_POINTS {
+        return Err(too_few(points.len()));
+    }
+    // An odd step, so that the points do not lie in a few columns only.
+    let step = (points.len() / MAX_POINTS) | 1;
+    let few: Vec<SmoothPoint> = points.iter().copied().step_by(step).collect();
+    SmoothMap::fit(shape, &few).ok_or_else(|| too_few(few.len()))
+}
+
 fn check(
     phases: &Phases,
     code: &CodedPictures,
@@ -153,6 +178,14 @@ fn check(
     let (rows, columns) = lit.dim();
     check_frames(phases.frames, 1)?;
     check_shape("phases", "[pictures, t, s]", phases.images.shape(), &[PHASES, rows, columns])?;
+    check_code(code, lit.dim(), lines)
+}
+
+fn check_code(
+    code: &CodedPictures,
+    (rows, columns): (usize, usize),
+    lines: usize,
+) -> Result<(), ImagesError> {
     let pictures = code.images.len_of(Axis(0));
     check_shape("code", "[pictures and inverses, t, s]", code.images.shape(), &[pictures, rows, columns])?;
     let block = code.lines_per_block;
@@ -174,14 +207,8 @@ fn check(
 fn own_place(phases: &Phases, code: &CodedPictures, lines: usize, t: usize, column: usize) -> Option<f64> {
     let light = phases.images.slice(s![.., t, column]);
     let brightest = (0..PHASES).max_by(|&a, &b| light[a].total_cmp(&light[b]))?;
-    let of_code = code.images.slice(s![.., t, column]);
-    let mut block = 0;
-    for bit in 0..of_code.len() / 2 {
-        let lit = usize::from(of_code[2 * bit] > of_code[2 * bit + 1]);
-        block = 2 * block + (lit ^ (block & 1));
-    }
     let size = code.lines_per_block as f64;
-    let centre = block as f64 * size + (size - 1.0) / 2.0;
+    let centre = block(code, t, column) as f64 * size + (size - 1.0) / 2.0;
     let line = brightest as f64 + PHASES as f64 * ((centre - brightest as f64) / PHASES as f64).round();
     let complete = (REACH + 1) as f64..=lines as f64 - (REACH + 2) as f64;
     if !complete.contains(&line) {
@@ -194,4 +221,13 @@ fn own_place(phases: &Phases, code: &CodedPictures, lines: usize, t: usize, colu
         moment += counts * (step as f64 - REACH as f64);
     }
     (sum > 0.0).then(|| line + moment / sum)
+}
+
+/// The number of the block of lines that a pixel sees.
+fn block(code: &CodedPictures, t: usize, column: usize) -> usize {
+    let of_code = code.images.slice(s![.., t, column]);
+    (0..of_code.len() / 2).fold(0, |block, bit| {
+        let lit = usize::from(of_code[2 * bit] > of_code[2 * bit + 1]);
+        2 * block + (lit ^ (block & 1))
+    })
 }

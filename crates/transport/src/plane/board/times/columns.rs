@@ -4,11 +4,13 @@ use ndarray::{Array2, ArrayView1, ArrayView2, ArrayView3, s};
 
 use super::super::super::PlaneError;
 use super::super::super::error::check_shape;
-use super::super::super::model::{FIRST_RESPONSE_ROW, RESPONSE_ROWS};
+use super::super::super::model::{FIRST_RESPONSE_ROW, FlyingSpot, RESPONSE_ROWS, Scan};
 
 /// Largest number of groups into which the columns of the image are averaged. More groups hardly help: they differ
 /// only in the fraction of a row at which their pixels lie.
 const GROUPS: usize = 12;
+/// Least part of the projector's width that a group of columns is taken to see: a spot is not a point.
+const LEAST_WIDTH: f64 = 1.0 / 32.0;
 
 /// What each camera row sees of each drawn row, averaged over groups of neighbouring columns.
 ///
@@ -23,6 +25,8 @@ pub struct Columns {
     cells: Vec<Cell>,
     /// Cumulative responses, `[row * groups + group, rows]`.
     cumulative: Array2<f64>,
+    /// The fraction of each row's dwell that has passed when half of its light has been sent, of the same shape.
+    middles: Array2<f64>,
     /// For each camera row, the drawn rows that any of its cells sees.
     reach: Vec<(f64, f64)>,
 }
@@ -38,17 +42,46 @@ pub(super) struct Cell {
     first_row: i64,
     /// Number of drawn rows in the response.
     rows: usize,
+    /// The fraction of a row's dwell in which it lights the cell.
+    dwell: f64,
+    /// Standard deviation of a row's light sent while it passes the cell, as a share of it.
+    step_sd: f64,
+}
+
+/// Shares of a cell's light.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct LightSent {
+    /// What has been sent.
+    pub sent: f64,
+    /// What would be sent in the time of a row if light went on as at this moment.
+    pub sending: f64,
+    /// Standard deviation of what has been sent: a spot lights one pixel after the other.
+    pub sd: f64,
 }
 
 impl Columns {
     /// From each pixel's `place` in projector rows, NaN where it is unlit, and its `response` `[16, t, s]`:
-    /// the share of its light that drawn row `round(place) + d` sends, for `d` from -7 to 8.
+    /// the share of its light that drawn row `round(place) + d` sends, for `d` from -7 to 8. Rows are lit evenly, or by
+    /// a spot, whose columns are those of the lit pixels.
     ///
     /// # Errors
     /// [`PlaneError::Shape`] if the arrays do not fit together; [`PlaneError::OutOfRange`] for a response of a lit
     /// pixel whose sum is not 1 to within 1 %, or for an image without lit pixels.
-    pub fn new(place: ArrayView2<f32>, response: ArrayView3<f32>) -> Result<Self, PlaneError> {
+    pub fn new(
+        place: ArrayView2<f32>,
+        response: ArrayView3<f32>,
+        spot: Option<&FlyingSpot>,
+    ) -> Result<Self, PlaneError> {
         let (rows, columns) = place.dim();
+        if let Some(spot) = spot {
+            spot.check((rows, columns))?;
+            let is_unknown =
+                |((t, s), place): ((usize, usize), &f32)| place.is_finite() && spot.column(t, s).is_nan();
+            if place.indexed_iter().any(is_unknown) {
+                let allowed = "known in every lit pixel: give pixels without a column no place either";
+                return Err(PlaneError::OutOfRange { field: "columns", value: f64::NAN, allowed });
+            }
+        }
         check_shape("response", "[16, t, s]", response.shape(), &[RESPONSE_ROWS, rows, columns])?;
         let lit = place.mapv(f32::is_finite);
         if !lit.iter().any(|&lit| lit) {
@@ -63,6 +96,7 @@ impl Columns {
             (0..count).map(|group| group * columns / count..(group + 1) * columns / count).collect();
         let mut cells = Vec::with_capacity(rows * count);
         let mut responses: Vec<Vec<f64>> = Vec::with_capacity(rows * count);
+        let mut passes: Vec<Vec<f64>> = Vec::with_capacity(rows * count);
         for row in 0..rows {
             for group in &groups {
                 let pixels: Vec<usize> = group.clone().filter(|&column| lit[[row, column]]).collect();
@@ -70,10 +104,27 @@ impl Columns {
                 let first = pixels.iter().map(|&column| own_row(column)).min().unwrap_or(0);
                 let last = pixels.iter().map(|&column| own_row(column)).max().unwrap_or(0);
                 let mut sum = vec![0.0; (last - first) as usize + RESPONSE_ROWS];
+                let mut passed = sum.clone();
+                let (mut leftmost, mut rightmost) = (f64::MAX, f64::MIN);
                 for &column in &pixels {
                     let shift = (own_row(column) - first) as usize;
                     let shares = pixel_response(response.slice(s![.., row, column]))?;
+                    let passes = spot.map_or(0.5, |spot| spot.column(row, column));
+                    (leftmost, rightmost) = (leftmost.min(passes), rightmost.max(passes));
                     sum[shift..].iter_mut().zip(shares).for_each(|(sum, share)| *sum += share);
+                    passed[shift..].iter_mut().zip(shares).for_each(|(sum, share)| *sum += share * passes);
+                }
+                // A spot passes the pixels that see more of a row than the others at a time of its own.
+                let backwards = |v: i64| {
+                    v.rem_euclid(2) == 1 && spot.is_some_and(|spot| spot.scan == Scan::Bidirectional)
+                };
+                let whole = (leftmost + rightmost) / 2.0;
+                for ((passed, sum), v) in
+                    passed.iter_mut().zip(&sum).zip(first + i64::from(FIRST_RESPONSE_ROW)..)
+                {
+                    let middle = *passed / sum;
+                    let middle = if (leftmost..=rightmost).contains(&middle) { middle } else { whole };
+                    *passed = if backwards(v) { 1.0 - middle } else { middle };
                 }
                 let places = pixels.iter().map(|&column| f64::from(place[[row, column]]));
                 cells.push(Cell {
@@ -81,12 +132,24 @@ impl Columns {
                     place: places.sum::<f64>() / pixels.len() as f64,
                     first_row: first + i64::from(FIRST_RESPONSE_ROW),
                     rows: sum.len(),
+                    // From the border of the first pixel to that of the last.
+                    dwell: spot.map_or(1.0, |_| {
+                        let between = pixels.len() as f64 - 1.0;
+                        ((rightmost - leftmost) * (1.0 + between.max(1.0).recip())).max(LEAST_WIDTH)
+                    }),
+                    // That of a uniform distribution over one pixel.
+                    step_sd: spot.map_or(0.0, |_| 12.0_f64.sqrt().recip() / pixels.len().max(1) as f64),
                 });
+                passes.push(passed);
                 responses.push(sum.iter().map(|sum| sum / pixels.len().max(1) as f64).collect());
             }
         }
         let longest = responses.iter().map(Vec::len).max().unwrap_or(0);
         let mut cumulative = Array2::zeros((cells.len(), longest + 1));
+        let mut middles = Array2::from_elem((cells.len(), longest), 0.5);
+        for (mut middles, passes) in middles.outer_iter_mut().zip(&passes) {
+            middles.iter_mut().zip(passes).for_each(|(middle, passed)| *middle = *passed);
+        }
         for (mut cumulative, response) in cumulative.outer_iter_mut().zip(&responses) {
             for index in 0..longest {
                 cumulative[index + 1] = cumulative[index] + response.get(index).unwrap_or(&0.0);
@@ -100,7 +163,16 @@ impl Columns {
                 *end = end.max(row as f64 + 1.0);
             }
         }
-        Ok(Self { lit, groups, cells, cumulative, reach })
+        Ok(Self { lit, groups, cells, cumulative, middles, reach })
+    }
+
+    /// The same under a spot that takes this part of a row's time, or more, to pass a group of columns; `None` if rows are
+    /// lit evenly.
+    pub(super) fn blurred(&self, dwell: f64) -> Option<Self> {
+        let is_even = self.cells.iter().all(|cell| cell.step_sd == 0.0);
+        let mut cells = self.cells.clone();
+        cells.iter_mut().for_each(|cell| cell.dwell = cell.dwell.max(dwell));
+        (!is_even).then(|| Self { cells, ..self.clone() })
     }
 
     /// The mean of an image over the lit pixels of each group, `[rows, groups]`; 0 where a group has none.
@@ -172,23 +244,32 @@ impl Columns {
         sum / pixels as f64
     }
 
-    /// The share of a cell's light that has been sent when `drawn` rows (with a fraction) have been drawn, and the
-    /// share that the row being drawn sends in all.
+    /// The light of a cell when `drawn` rows (with a fraction) have been drawn.
     #[inline]
-    pub(super) fn light_before(&self, row: usize, group: usize, drawn: f64) -> (f64, f64) {
+    pub(super) fn light_before(&self, row: usize, group: usize, drawn: f64) -> LightSent {
         let index = row * self.groups.len() + group;
         let cell = &self.cells[index];
         let cumulative = self.cumulative.row(index);
+        let steady = |sent: f64| LightSent { sent, sending: 0.0, sd: 0.0 };
         let from_first = drawn - cell.first_row as f64;
         if from_first <= 0.0 {
-            return (0.0, 0.0);
+            return steady(0.0);
         }
         let whole = from_first as usize;
         if whole >= cell.rows {
-            return (cumulative[cell.rows], 0.0);
+            return steady(cumulative[cell.rows]);
         }
         let share = cumulative[whole + 1] - cumulative[whole];
-        (cumulative[whole] + (from_first - whole as f64) * share, share)
+        let before_middle = from_first - whole as f64 - self.middles[[index, whole]];
+        match before_middle / cell.dwell + 0.5 {
+            ..=0.0 => steady(cumulative[whole]),
+            1.0.. => steady(cumulative[whole + 1]),
+            part => LightSent {
+                sent: cumulative[whole] + part * share,
+                sending: share / cell.dwell,
+                sd: share * cell.step_sd,
+            },
+        }
     }
 }
 

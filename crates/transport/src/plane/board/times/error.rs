@@ -74,7 +74,7 @@ pub enum TimesError {
     /// The model does not describe the frames.
     #[error(
         "chi^2 / n is {chi2_per_sample:.1} for exposures of {exposure_us} us, but must be at most {limit}: rows are \
-         not lit evenly (measure the spot with even and odd rows), or the responses are those of another picture"
+         lit neither evenly nor by a spot in a direction that is known, or the responses are those of another picture"
     )]
     Misfit {
         /// Mean square of residuals, each divided by its expected variance.
@@ -113,15 +113,10 @@ pub enum TimesError {
         /// Largest allowed difference.
         limit_us: f64,
     },
-    /// The columns span too little of the projector's width to see a spot move.
+    /// A spot draws the rows in a direction that cannot be told.
     #[error(
-        "the image spans {span_percent:.0} % of the projector's width, but a spot's slope takes {needed_percent:.0} \
-         %: widen the camera's region"
+        "a flying spot draws the rows, but whether odd rows are drawn backwards cannot be told: the image sees too \
+         little of the projector's width near its middle; widen the camera's region"
     )]
-    Narrow {
-        /// Share of the projector's width.
-        span_percent: f64,
-        /// Share needed.
-        needed_percent: f64,
-    },
+    Direction,
 }

@@ -1,7 +1,9 @@
 use nalgebra::{DMatrix, DVector};
+use ndarray::{ArrayView2, ArrayView3};
 
 use super::super::super::NoiseModel;
 use super::super::super::error::check_shape;
+use super::super::super::model::{FlyingSpot, Scan};
 use super::super::Estimate;
 use super::coarse::{Arrivals, CoarseSweep, arrivals, median};
 use super::columns::Columns;
@@ -22,6 +24,9 @@ const STEP_US: f64 = 8.0;
 /// Steps below this end the fit.
 const CONVERGED_US: f64 = 0.02;
 const MAX_STEPS: usize = 20;
+/// The parts of a row's time that a spot is first taken to need to pass a group of columns: steps would be lost among the
+/// moments at which a narrow one passes.
+const BLURS: [f64; 3] = [0.25, 0.125, 0.0625];
 /// Frames whose jitter is farther from the median, in robust standard deviations, are dropped.
 const OUTLIER_SDS: f64 = 4.5;
 /// Frames whose chi^2 per sample exceeds both this value and this multiple of the median are dropped.
@@ -50,7 +55,7 @@ impl RowTimes {
     /// Fits the times of rows to single frames of the board. `noise` is that of a single pixel, in shares of white.
     ///
     /// # Errors
-    /// Any [`TimesError`] other than [`TimesError::Narrow`].
+    /// Any [`TimesError`] but [`TimesError::Direction`]; [`TimesError::Misfit`] if rows are not lit as `columns` has it.
     pub fn fit(
         columns: &Columns,
         frames: &[BoardFrame],
@@ -64,9 +69,13 @@ impl RowTimes {
         }
         let coarse = CoarseSweep::from_borders(columns, frames, nominal)?;
         let arrivals = arrivals(columns, frames)?;
+        let blurred = BLURS.map(|dwell| columns.blurred(dwell));
         let mut fit = Fit::start(columns, frames, nominal, noise, &coarse, &arrivals)?;
-        fit.scan_jitters();
-        fit.steps(3, false)?;
+        for blurred in blurred.iter().flatten().chain([columns]) {
+            fit.columns = blurred;
+            fit.scan_jitters();
+            fit.steps(3, false)?;
+        }
         fit.scan_jitters();
         fit.steps(MAX_STEPS, false)?;
         fit.drop_outliers();
@@ -80,6 +89,30 @@ impl RowTimes {
         fit.steps(MAX_STEPS, false)?;
         fit.check_exposures()?;
         fit.result(jitter_us, residuals)
+    }
+
+    /// The same for rows that are drawn by a flying spot whose direction is unknown, which passes the projector's
+    /// `columns` that pixels see, `[t, s]` in 0..=1. `place` and `response` are those of [`Columns::new`]. `None` if no
+    /// direction explains the frames.
+    ///
+    /// # Errors
+    /// [`TimesError::Direction`] if both do; those of [`Columns::new`].
+    pub fn find_spot(
+        (place, response): (ArrayView2<f32>, ArrayView3<f32>),
+        columns: ArrayView2<f32>,
+        frames: &[BoardFrame],
+        nominal: &Nominal,
+        noise: NoiseModel,
+    ) -> Result<Option<(Self, FlyingSpot)>, TimesError> {
+        let fit = |scan| {
+            let spot = FlyingSpot { scan, columns: columns.to_owned() };
+            let columns = Columns::new(place, response, Some(&spot))?;
+            Ok::<_, TimesError>(Self::fit(&columns, frames, nominal, noise).ok().map(|times| (times, spot)))
+        };
+        match (fit(Scan::OneWay)?, fit(Scan::Bidirectional)?) {
+            (Some(_), Some(_)) => Err(TimesError::Direction),
+            (one_way, bidirectional) => Ok(one_way.or(bidirectional)),
+        }
     }
 }
 

@@ -8,8 +8,8 @@
 //!
 //! The order of calls is: [`Columns::new`] from the map of places and the responses; frames of [`sweep_settings`], each
 //! reduced by [`Columns::average`]; [`CoarseSweep::from_borders`]; frames of [`arrival_settings`] and [`check_settings`];
-//! [`RowTimes::fit`], which takes all of these frames; and, with pictures of even and of odd rows, [`spot_slopes`],
-//! which tells a flying spot from rows that are lit evenly.
+//! [`RowTimes::fit`], which takes all of these frames. Where it refuses them as a misfit, rows may not be lit evenly:
+//! [`RowTimes::find_spot`] tries how a flying spot would draw them.
 //!
 //! While a scene is measured, [`JitterGauge`] finds how late the light of each image is from a strip of the board that
 //! stays in view.
@@ -21,7 +21,6 @@ mod fit;
 mod model;
 mod result;
 mod settings;
-mod spot;
 mod strip;
 mod table;
 
@@ -32,5 +31,4 @@ pub use result::{Dropped, FrameJitter, Residual, RowTimes};
 pub use settings::{
     BoardFrame, BoardSetting, ExposureMode, Nominal, arrival_settings, check_settings, sweep_settings,
 };
-pub use spot::{SpotSlopes, spot_slopes};
 pub use strip::{JitterGauge, Lateness};

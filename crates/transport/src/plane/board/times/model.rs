@@ -209,15 +209,17 @@ impl FrameComparison<'_> {
             if pixels == 0 {
                 continue;
             }
-            let (before, opening_share) = self.columns.light_before(row, group, opening_row);
-            let (until, closing_share) = self.columns.light_before(row, group, closing_row);
-            let (a, b) = (opening_share * opening.rows_per_us, closing_share * closing.rows_per_us);
+            let before = self.columns.light_before(row, group, opening_row);
+            let until = self.columns.light_before(row, group, closing_row);
+            let (a, b) = (before.sending * opening.rows_per_us, until.sending * closing.rows_per_us);
             if !everywhere && a == 0.0 && b == 0.0 {
                 continue;
             }
-            let light = until - before + closing.periods - opening.periods;
+            let light = until.sent - before.sent + closing.periods - opening.periods;
+            let step_variance = before.sd * before.sd + until.sd * until.sd;
             let residual = f64::from(frame.light[[row, group]]) - light;
-            let variance = (self.noise.variance(light, pixels) + MODEL_VARIANCE) * self.variance_scale;
+            let noise = self.noise.variance(light, pixels);
+            let variance = (noise + MODEL_VARIANCE + step_variance) * self.variance_scale;
             let chi2 = residual * residual / variance;
             let weight = (ROBUST_SDS / chi2.sqrt().max(ROBUST_SDS)) / variance;
             sums.chi2 += chi2;

@@ -1,9 +1,10 @@
 use std::ops::Range;
 
-use ndarray::{ArrayView2, s};
+use ndarray::{Array2, ArrayView2, s};
 
+use super::super::super::model::FlyingSpot;
 use super::super::super::{NoiseModel, PlaneError, Setting};
-use super::super::{BoardCalibration, BoardStrip, Estimate};
+use super::super::{BoardCalibration, BoardStrip, Estimate, RowDrawing};
 use super::columns::Columns;
 use super::model::{BoardSamples, Clocks, FrameComparison, Sweep};
 use super::settings::{BoardFrame, BoardSetting, ExposureMode};
@@ -59,10 +60,25 @@ impl JitterGauge {
             }
         });
         let response = calibration.response.shares();
+        let spot = match &calibration.drawing {
+            Some(RowDrawing::Spot(spot)) => {
+                let columns = spot.columns.slice(of_strip).to_owned();
+                Some(FlyingSpot { columns, ..*spot })
+            }
+            Some(RowDrawing::Even) | None => None,
+        };
+        if let Some(spot) = &spot {
+            let unknown = Array2::from_shape_fn(places.dim(), |(t, s)| spot.column(t, s).is_nan());
+            places.zip_mut_with(&unknown, |place, unknown| {
+                if *unknown {
+                    *place = f32::NAN;
+                }
+            });
+        }
         Ok(Self {
             strip: strip.clone(),
             noise: calibration.noise,
-            seen: Columns::new(places.view(), response.slice(s![.., .., start..end]))?,
+            seen: Columns::new(places.view(), response.slice(s![.., .., start..end]), spot.as_ref())?,
             sweep: Sweep::new(calibration.row_starts_us.clone(), period_us),
             camera_row_us: calibration.camera_row_time_us.value,
             centre_us,
