@@ -26,7 +26,8 @@ usage: cargo xtask <command>
   test [--no-guest]  installs what the tests need, checks format, lints and tests, the guest's last;
                      --no-guest leaves those out
   packages           what the tests need of Debian, what of it is missing, and how to install it
-  fresh [12|13]...   runs demo and test of the last commit on a bare Debian 12 and 13, or on one
+  fresh [12|13]...   runs demo and test of the last commit on a bare Debian 12 (bookworm) and 13 (trixie), or on
+                     one: about 40 minutes each
   deb                builds the Debian package and prints its path
   guest [TEST...]    the drivers' tests against real kernel drivers in a QEMU guest, or some of them
   guest --systemd    the package under systemd in a QEMU guest: installed, used, killed, cut off from power; not
@@ -60,8 +61,14 @@ fn main() -> ExitCode {
         }
         ["fresh", releases @ ..] => fresh::fresh(releases),
         ["guest", "--systemd"] => guest::systemd::systemd(),
+        ["guest", option, ..] if option.starts_with('-') => {
+            Err(format!("`{option}` is not an option of guest; there is --systemd, alone"))
+        }
         ["guest", names @ ..] => guest::guest(names),
         ["soak"] => soak::soak(20.0),
+        ["soak", "--minutes"] => {
+            Err("`--minutes` needs a number of minutes, such as --minutes 60".to_owned())
+        }
         ["soak", "--minutes", minutes] => match minutes.parse::<f64>() {
             Ok(minutes) if (0.0..=100_000.0).contains(&minutes) => soak::soak(minutes),
             _ => Err(format!("`{minutes}` is not a number of minutes from 0 to 100000")),

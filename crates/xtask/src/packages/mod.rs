@@ -9,6 +9,9 @@ use crate::rootfs::is_root;
 use crate::run::{Done, say};
 use list::{PATH, PackageEntry};
 
+/// By these, compilers, pkg-config and clang-sys search.
+const SEARCHED_BY: [&str; 6] =
+    ["LIBCLANG_PATH", "CC", "CXX", "PKG_CONFIG", "PKG_CONFIG_PATH", "PKG_CONFIG_LIBDIR"];
 /// Advice for systems other than those of the list.
 const ELSEWHERE: &str = "tests/packages.txt is made for Debian 12 and 13. On another system, install by its own means what serves the same\n\
                          purposes, until `cargo xtask packages` finds all; then run `cargo xtask test --no-guest`";
@@ -101,7 +104,20 @@ fn chosen(missing: &[Missing], known: &[String]) -> Done<Vec<String>> {
 
 /// How this system's user installs what is missing.
 fn advice(missing: &[Missing], known: &[String]) -> String {
-    if apt::is_there() { by_hand(missing, known, is_root()) } else { ELSEWHERE.to_owned() }
+    let installed = if apt::is_there() { by_hand(missing, known, is_root()) } else { ELSEWHERE.to_owned() };
+    format!("{}{installed}", misled())
+}
+
+/// Variables by which programs and libraries are searched, if any is set: a wrong one hides what is installed.
+fn misled() -> String {
+    let set = SEARCHED_BY
+        .into_iter()
+        .filter_map(|name| std::env::var_os(name).map(|value| format!("  {name}={}\n", value.display())));
+    let set: String = set.collect();
+    match set.is_empty() {
+        true => set,
+        false => format!("these variables say where to look; correct or unset a wrong one first:\n{set}"),
+    }
 }
 
 /// The command to run. Apt's lists may never have been fetched, which only root can do, so packages missing from them
@@ -137,8 +153,9 @@ fn still_missing(missing: &[Missing]) -> Done {
     }
     Err(format!(
         "installed, but what they are needed for is still not found ({PATH} says how it is looked \
-         for):\n{}\n{ELSEWHERE}",
-        lines(missing)
+         for):\n{}\n{}{ELSEWHERE}",
+        lines(missing),
+        misled()
     ))
 }
 
