@@ -1,14 +1,16 @@
 //! State on disk while a mirror is away from rest: enough to know its position after the process is gone.
 //!
 //! `NAME` contains the sequence; it is written, fsynced and renamed before the first sample is sent. `NAME.sent`
-//! contains two numbers: samples that have certainly left the process, and samples that may have left it. It is
-//! written before and after each write to the port, without fsync: it only has to survive the process, and a crash of
-//! the machine is detected by the boot id. `NAME.lock` is locked by the process that drives the mirror.
+//! contains three numbers: samples that have certainly left the process, samples that may have left it, and the number
+//! of the sequence that they belong to; of any other sequence, none has left. So a process that is killed between the
+//! writes of the two files leaves a state that is true. It is written before and after each write to the port, without
+//! fsync: it only has to survive the process, and a crash of the machine is detected by the boot id. `NAME.lock` is locked by the process that drives the mirror.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
 use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use nix::errno::Errno;
@@ -19,8 +21,8 @@ use serde::{Deserialize, Serialize};
 use super::light::{LightGuard, LightState, boot_id};
 use super::sequence::Sequence;
 
-/// Characters of `NAME.sent`: two numbers of 20 digits, a space and a newline.
-const SENT_BYTES: usize = 42;
+/// Characters of `NAME.sent`: three numbers of 20 digits, two spaces and a newline.
+const SENT_BYTES: usize = 63;
 
 /// Why a mirror's state cannot be stored or read.
 #[derive(Debug, thiserror::Error)]
@@ -88,6 +90,9 @@ pub(super) struct MirrorState {
     pub reach: Reach,
     pub limits: MirrorLimits,
     pub rate_hz: f64,
+    /// The number of this state, another for each; 0 in files of earlier versions.
+    #[serde(default)]
+    pub number: u64,
     /// The sequence being played; `None` if the mirror is at rest.
     pub playing: Option<Sequence>,
 }
@@ -99,10 +104,17 @@ pub(super) struct Sent {
     pub possibly: u64,
 }
 
+impl Sent {
+    /// The controller's FIFO may have been emptied since: what was sent does not tell the place any more.
+    pub const EMPTIED: Self = Self { certainly: u64::MAX, possibly: u64::MAX };
+}
+
 /// The files of one mirror, locked.
 pub struct StateFile {
     path: PathBuf,
     sent: File,
+    /// Number of the state on disk.
+    number: AtomicU64,
     _lock: Flock<File>,
 }
 
@@ -139,7 +151,9 @@ impl StateFile {
             .read(true)
             .open(&sent_path)
             .map_err(StateError::io("open", &sent_path))?;
-        Ok(Self { path: path.to_owned(), sent, _lock: lock })
+        // A damaged state is told by whoever reads it.
+        let number = read(path).ok().flatten().map_or(0, |(state, _)| state.number);
+        Ok(Self { path: path.to_owned(), sent, number: number.into(), _lock: lock })
     }
 
     /// Path of the state file.
@@ -149,24 +163,28 @@ impl StateFile {
 
     /// Writes a state to disk, with no samples sent.
     pub(super) fn write(&self, state: &MirrorState) -> Result<(), StateError> {
-        self.note_sent(Sent { certainly: 0, possibly: 0 })?;
+        let number = self.number.load(Ordering::Relaxed).wrapping_add(1);
+        let state = MirrorState { number, ..state.clone() };
         let temporary = beside(&self.path, "new");
         let write = || -> io::Result<()> {
             let mut file = File::create(&temporary)?;
-            file.write_all(&serde_json::to_vec(state)?)?;
+            file.write_all(&serde_json::to_vec(&state)?)?;
             file.sync_all()?;
             fs::rename(&temporary, &self.path)?;
+            self.number.store(number, Ordering::Relaxed);
             let folder = self.path.parent().filter(|folder| !folder.as_os_str().is_empty());
             File::open(folder.unwrap_or(Path::new(".")))?.sync_all()
         };
-        write().map_err(StateError::io("write", &self.path))
+        write().map_err(StateError::io("write", &self.path))?;
+        self.note_sent(Sent { certainly: 0, possibly: 0 })
     }
 
     /// Records how much was sent.
     pub(super) fn note_sent(&self, sent: Sent) -> Result<(), StateError> {
         let mut line = [0; SENT_BYTES];
         // 20 digits fit any u64, so the line has a constant length.
-        let _ = writeln!(&mut line[..], "{:020} {:020}", sent.certainly, sent.possibly);
+        let number = self.number.load(Ordering::Relaxed);
+        let _ = writeln!(&mut line[..], "{:020} {:020} {number:020}", sent.certainly, sent.possibly);
         self.sent.write_all_at(&line, 0).map_err(StateError::io("write", &beside(&self.path, "sent")))
     }
 
@@ -181,7 +199,7 @@ fn read(path: &Path) -> Result<Option<(MirrorState, Sent)>, StateError> {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
         read => read.map_err(StateError::io("read", path))?,
     };
-    let state = serde_json::from_slice(&text)
+    let state: MirrorState = serde_json::from_slice(&text)
         .map_err(|source| StateError::Damaged { path: path.to_owned(), source })?;
     let sent_path = beside(path, "sent");
     let sent = read_regular(&sent_path).map_err(StateError::io("read", &sent_path))?;
@@ -190,7 +208,9 @@ fn read(path: &Path) -> Result<Option<(MirrorState, Sent)>, StateError> {
     })?;
     let mut numbers = sent.split_whitespace().map(|number| number.parse().unwrap_or(0));
     let mut next = || numbers.next().unwrap_or(0);
-    Ok(Some((state, Sent { certainly: next(), possibly: next() })))
+    let (sent, number) = (Sent { certainly: next(), possibly: next() }, next());
+    let sent = if number == state.number { sent } else { Sent { certainly: 0, possibly: 0 } };
+    Ok(Some((state, sent)))
 }
 
 /// Reads a file that somebody may have named: a pipe would block, a device has no end.
@@ -247,7 +267,7 @@ impl MirrorState {
         playing: Option<Sequence>,
     ) -> Result<Self, StateError> {
         let boot_id = boot_id().map_err(StateError::io("read", Path::new("boot_id")))?;
-        Ok(Self { boot_id, reach, limits, rate_hz, playing })
+        Ok(Self { boot_id, reach, limits, rate_hz, number: 0, playing })
     }
 
     /// Whether data written without fsync are still valid.

@@ -23,6 +23,8 @@ const LOCK_PACE: Duration = Duration::from_millis(10);
 
 /// How long to wait for bytes between two looks at a timeout.
 const LOOK_EVERY: Duration = Duration::from_millis(1);
+/// The longest time between looks of a host that is not busy.
+const LOOK: Duration = Duration::from_millis(2);
 
 /// After this long without a reply, none is on its way: a line at 115,200 baud and a USB adapter's 16 ms are faster.
 const SILENCE: Duration = Duration::from_millis(50);
@@ -146,7 +148,7 @@ impl Port {
         parse: impl Fn(&[u8]) -> Parsed<R>,
         mut pick: impl FnMut(R) -> Option<T>,
     ) -> Result<Option<T>, DeviceError> {
-        let mut timeout = Timeout::new(timeout, Instant::now());
+        let mut timeout = Timeout::new(timeout, LOOK, Instant::now());
         loop {
             let is_over = timeout.look(Instant::now());
             while let Some(reply) = self.reply(&parse)? {

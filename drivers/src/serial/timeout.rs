@@ -4,10 +4,6 @@ use std::time::{Duration, Instant};
 
 /// Minimum number of looks before a timeout is over.
 const LOOKS: u32 = 16;
-/// The most that a look uses up, which is longer than the pace at which a port is looked at. With 10 runnable threads on
-/// 2 processors, the kernel's workers, through which a serial line's bytes pass, were seen to wait for 0.3 s.
-const LOOK: Duration = Duration::from_millis(2);
-
 /// A timeout of which each look uses up little, so that a host that stands still or is busy does not use it up.
 #[derive(Debug)]
 pub(crate) struct Timeout {
@@ -17,8 +13,11 @@ pub(crate) struct Timeout {
 }
 
 impl Timeout {
-    pub fn new(time: Duration, now: Instant) -> Self {
-        let most_per_look = (time / LOOKS).clamp(Duration::from_nanos(1), LOOK);
+    /// A timeout that begins `now`, of which a look uses up at most `look`: the longest time between looks of a host that
+    /// is not busy. With 10 runnable threads on 2 processors, the kernel's workers, through which a serial line's bytes
+    /// pass, were seen to wait for 0.3 s.
+    pub fn new(time: Duration, look: Duration, now: Instant) -> Self {
+        let most_per_look = (time / LOOKS).min(look).max(Duration::from_nanos(1));
         Self { most_per_look, left: time, looked: now }
     }
 
@@ -40,7 +39,8 @@ mod tests {
         let began = Instant::now();
         let ms = |ms| began + Duration::from_millis(ms);
         let over_after = |timeout_ms| {
-            let mut timeout = Timeout::new(Duration::from_millis(timeout_ms), began);
+            let mut timeout =
+                Timeout::new(Duration::from_millis(timeout_ms), Duration::from_millis(2), began);
             (1..).find(|look| timeout.look(ms(1000 * look)))
         };
         assert_eq!([16, 300].map(over_after), [Some(16), Some(150)]);
@@ -49,7 +49,7 @@ mod tests {
     #[test]
     fn who_looks_often_waits_for_the_time_stated() {
         let began = Instant::now();
-        let mut timeout = Timeout::new(Duration::from_millis(160), began);
+        let mut timeout = Timeout::new(Duration::from_millis(160), Duration::from_millis(2), began);
         let over = (1..).find(|&ms| timeout.look(began + Duration::from_millis(ms)));
         assert_eq!(over, Some(160));
     }

@@ -3,13 +3,13 @@
 use std::io::{BufRead, BufReader};
 use std::os::unix::process::ExitStatusExt;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use raysweep_core::{Clock, DeviceErrorKind, Mirror};
+use raysweep_core::{Clock, DeviceErrorKind, Mirror, MirrorPath, Tilt};
 use raysweep_drivers::mirror::{
     self, Guardian, LightGuard, Mti, ParkError, Parked, PlayzerX, StateError, arm_light, park,
     park_when_closed,
@@ -60,6 +60,78 @@ fn panic() {
     }));
     assert!(panicked.is_err());
     rig.assert_parked().print("panic", since_ns);
+}
+
+/// Starts at (3, 2) degrees and never comes near the origin.
+fn far() -> MirrorPath {
+    MirrorPath::lissajous(Tilt::new(3.0, 2.0), [10, 7], 6500, 39_000.0, &LIMITS).unwrap()
+}
+
+/// The state's next file is a pipe, at which a process that writes it stops, to be killed there.
+#[test]
+fn sigkill_while_the_state_is_being_written() {
+    for when in ["start", "park"] {
+        let rig = Rig::good();
+        let mut child = Command::new(std::env::current_exe().unwrap())
+            .args(["--exact", "ways_out::child_that_writes_into_a_pipe", "--ignored", "--nocapture"])
+            .env("MIRROR_PORT", rig.pty.path())
+            .env("MIRROR_STATE", rig.state())
+            .env("MIRROR_WHEN", when)
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+        assert!(lines.any(|line| line.unwrap().contains("about to write")));
+        std::thread::sleep(Duration::from_millis(300));
+        kill(Pid::from_raw(child.id() as i32), Signal::SIGKILL).unwrap();
+        child.wait().unwrap();
+        std::fs::remove_file(format!("{}.new", rig.state().display())).unwrap();
+        let from = rig.pty.look(|truth| truth.held.len());
+        let parked = park(&rig.state()).unwrap();
+        let step = rig.pty.look(|truth| largest_step(&truth.held[from.saturating_sub(1)..]));
+        println!("killed in {when}: {parked:?}, largest step {step} codes");
+        // The FIFO was emptied, and the place where it stopped was not recorded: the drive is switched off.
+        if when == "park" {
+            assert!(matches!(parked, Parked::ByReset), "{parked:?}");
+            continue;
+        }
+        assert!(step <= LIMITS.max_step.0 / 6.5 * 2047.0 + 2.0, "{when}: {step} codes");
+    }
+}
+
+#[test]
+#[ignore = "not a test: a process that another test starts and kills"]
+fn child_that_writes_into_a_pipe() {
+    let Some(port) = std::env::var_os("MIRROR_PORT") else { return };
+    let state = PathBuf::from(std::env::var_os("MIRROR_STATE").unwrap());
+    let light = LightGuard { armed_file: state.with_extension("armed"), interlock: None };
+    arm_light(&light.armed_file).unwrap();
+    let next = PathBuf::from(format!("{}.new", state.display()));
+    let config = mirror::PlayzerXConfig {
+        port: port.into(),
+        link: mirror::PlayzerXLink::VirtualCom,
+        full_scale: LIMITS.max_tilt,
+        limits: LIMITS,
+        state,
+        light,
+    };
+    let mut mirror = PlayzerX::open(config).unwrap();
+    mirror.load(&far()).unwrap();
+    let stop = || {
+        nix::unistd::mkfifo(&next, nix::sys::stat::Mode::S_IRUSR | nix::sys::stat::Mode::S_IWUSR).unwrap();
+        println!("about to write");
+    };
+    if std::env::var("MIRROR_WHEN").unwrap() == "start" {
+        stop();
+        mirror.start(1000).unwrap();
+    }
+    mirror.start(1000).unwrap();
+    for _ in 0..450 {
+        mirror.feed().unwrap();
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    stop();
+    mirror.park().unwrap();
 }
 
 #[test]

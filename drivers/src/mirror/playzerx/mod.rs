@@ -240,7 +240,14 @@ impl Mirror for PlayzerX {
         let (place, rate_hz) = match &mut self.phase {
             Phase::Parked => return Ok(()),
             Phase::Ready(path) => (path.at(0).tilt, path.rate_hz()),
-            Phase::Moving(stream) => (stream.halt(&mut self.port)?, stream.asked_rate_hz()),
+            Phase::Moving(stream) => {
+                // Who is killed before the travel is recorded leaves a place that nobody can know.
+                let noted = self.state.note_sent(Sent::EMPTIED);
+                if let Err(error) = noted {
+                    tracing::error!(%error, "a kill in the next milliseconds would leave a wrong place");
+                }
+                (stream.halt(&mut self.port)?, stream.asked_rate_hz())
+            }
         };
         darken(&mut self.port, place, self.config.full_scale)?;
         let sequence = Sequence::travel(place, Tilt::ORIGIN, rate_hz, &self.config.limits);
@@ -335,7 +342,13 @@ pub(super) fn recover(
     };
     let mut port = Port::open(DEVICE, name, BAUD)?;
     // The process may have died with a query pending.
-    let left = if state.is_plugged_in_since(name, *node) { stream::halt(&mut port, 1)? } else { None };
+    let is_known = state.is_plugged_in_since(name, *node) && sent != Sent::EMPTIED;
+    let left = if is_known {
+        file.note_sent(Sent::EMPTIED).map_err(of_state)?;
+        stream::halt(&mut port, 1)?
+    } else {
+        None
+    };
     let Some(left) = left else {
         // The reset switches off light and drive; the mirror springs back, damped by the drive's own filter.
         let mut bytes = PADDING.to_vec();

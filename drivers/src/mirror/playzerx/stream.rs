@@ -28,6 +28,8 @@ const ASK_EVERY: Duration = Duration::from_millis(10);
 const LONGEST_ROUND_TRIP: Duration = Duration::from_millis(5);
 /// Maximum time for an answer while the FIFO, of three seconds, plays on.
 const ANSWER_WAIT: Duration = Duration::from_secs(1);
+/// The longest time between two steps of a host that is not busy.
+const STEP: Duration = Duration::from_millis(20);
 /// Maximum time that a controller may pause before it processes a command.
 const HALT_WAIT: Duration = Duration::from_secs(1);
 /// How long to wait after an answer for the answers to the other queries sent with it.
@@ -160,7 +162,7 @@ impl SampleStream {
         let samples = self.next - self.certain;
         if self.out.len() > samples as usize * SAMPLE_BYTES {
             self.asked = now;
-            let timeout = Timeout::new(ANSWER_WAIT, now);
+            let timeout = Timeout::new(ANSWER_WAIT, STEP, now);
             self.question = Some(Question { asked: now, sent: self.next, timeout });
         }
         self.certain = self.next;
@@ -220,7 +222,7 @@ impl SampleStream {
 
     /// Returns an error if the FIFO does not drain, in which case the mirror does not move.
     fn check_motion(&self) -> Result<(), DeviceError> {
-        let waiting = self.began.is_some() && self.played < self.certain && !self.may_have_run_dry();
+        let waiting = self.began.is_some() && self.played < self.certain;
         if waiting && self.answer_asked.saturating_duration_since(self.moved) > REPLY_WAIT {
             return Err(fault(
                 DeviceErrorKind::Timeout,
