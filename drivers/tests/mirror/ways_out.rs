@@ -99,6 +99,18 @@ fn sigkill_while_the_state_is_being_written() {
     }
 }
 
+fn open_playzerx(port: PathBuf, state: PathBuf, light: LightGuard) -> PlayzerX {
+    PlayzerX::open(mirror::PlayzerXConfig {
+        port,
+        link: mirror::PlayzerXLink::VirtualCom,
+        full_scale: LIMITS.max_tilt,
+        limits: LIMITS,
+        state,
+        light,
+    })
+    .unwrap()
+}
+
 #[test]
 #[ignore = "not a test: a process that another test starts and kills"]
 fn child_that_writes_into_a_pipe() {
@@ -107,15 +119,7 @@ fn child_that_writes_into_a_pipe() {
     let light = LightGuard { armed_file: state.with_extension("armed"), interlock: None };
     arm_light(&light.armed_file).unwrap();
     let next = PathBuf::from(format!("{}.new", state.display()));
-    let config = mirror::PlayzerXConfig {
-        port: port.into(),
-        link: mirror::PlayzerXLink::VirtualCom,
-        full_scale: LIMITS.max_tilt,
-        limits: LIMITS,
-        state,
-        light,
-    };
-    let mut mirror = PlayzerX::open(config).unwrap();
+    let mut mirror = open_playzerx(port.into(), state, light);
     mirror.load(&far()).unwrap();
     let stop = || {
         nix::unistd::mkfifo(&next, nix::sys::stat::Mode::S_IRUSR | nix::sys::stat::Mode::S_IWUSR).unwrap();
@@ -235,15 +239,7 @@ fn child() {
     let mut mirror: Box<dyn Mirror> = if std::env::var("MIRROR_DRIVER").unwrap() == "mti" {
         Box::new(Mti::open(mti_config(port.into(), state, light)).unwrap())
     } else {
-        let config = mirror::PlayzerXConfig {
-            port: port.into(),
-            link: mirror::PlayzerXLink::VirtualCom,
-            full_scale: LIMITS.max_tilt,
-            limits: LIMITS,
-            state,
-            light,
-        };
-        Box::new(PlayzerX::open(config).unwrap())
+        Box::new(open_playzerx(port.into(), state, light))
     };
     let path = if mirror.capabilities().fifo_samples == 1 { circle(60) } else { batch() };
     mirror.load(&path).unwrap();

@@ -16,11 +16,12 @@ use raysweep_transport::plane::board::{
     BoardCalibration, BoardStrip, CalibrationCovariance, CalibrationParameter, CameraCurve, Estimate,
     FlickeringLamp, RowDrawing,
 };
-use raysweep_transport::plane::calibrate::{FlyingSpot, Scan};
+use raysweep_transport::plane::calibrate::FlyingSpot;
 use raysweep_transport::plane::{NoiseModel, PixelResponse, RESPONSE_ROWS};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
+use super::drawing::CalibratedDrawing;
 use crate::plane::KnownCalibration;
 
 /// Version of the files' format.
@@ -74,72 +75,6 @@ pub struct CalibrationHeader {
     pub ambient: Option<CalibratedAmbient>,
     /// Figures of the calibration's own checks, each with its limit.
     pub checks: BTreeMap<String, Pair>,
-}
-
-/// How the projector draws its rows.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct CalibratedDrawing {
-    /// How it draws a row.
-    pub rows: Scanning,
-    /// Projector columns at which the left and right edges of the image see the board, in 0..=1 over the projector's
-    /// width; measured if a spot flies.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub columns: Option<[f64; 2]>,
-}
-
-/// How a projector draws a row.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Scanning {
-    /// The whole row is lit at once, evenly over its time.
-    Uniform,
-    /// By a spot that flies along every row from the first column to the last.
-    OneWay,
-    /// By a spot that flies along odd rows from the last column to the first.
-    Bidirectional,
-}
-
-impl CalibratedDrawing {
-    /// That of a spot, or of rows that are lit evenly.
-    pub(super) fn of(spot: Option<&FlyingSpot>) -> Self {
-        let Some(FlyingSpot { scan, columns }) = spot else {
-            return Self { rows: Scanning::Uniform, columns: None };
-        };
-        let edges = columns.rows().into_iter().filter_map(|row| {
-            let mut seen = row.iter().copied().filter(|column| column.is_finite());
-            let first = seen.next()?;
-            Some([first, seen.next_back().unwrap_or(first)])
-        });
-        let edges: Vec<[f32; 2]> = edges.collect();
-        let rows = match scan {
-            Scan::OneWay => Scanning::OneWay,
-            Scan::Bidirectional => Scanning::Bidirectional,
-        };
-        Self { rows, columns: Some([0, 1].map(|edge| median(edges.iter().map(|edges| edges[edge])))) }
-    }
-
-    /// The direction of the spot, if one draws the rows.
-    fn scan(&self) -> Option<Scan> {
-        match self.rows {
-            Scanning::Uniform => None,
-            Scanning::OneWay => Some(Scan::OneWay),
-            Scanning::Bidirectional => Some(Scan::Bidirectional),
-        }
-    }
-
-    /// In words.
-    pub fn text(&self) -> String {
-        let rows = match self.rows {
-            Scanning::Uniform => "lit evenly over their time",
-            Scanning::OneWay => "drawn by a flying spot, all in one direction",
-            Scanning::Bidirectional => "drawn by a flying spot, odd rows backwards",
-        };
-        let seen = self.columns.map(|[left, right]| {
-            format!("; the board is seen at columns {left:.3} to {right:.3} of the width")
-        });
-        format!("{rows}{}", seen.unwrap_or_default())
-    }
 }
 
 /// The devices that a calibration belongs to.
@@ -655,7 +590,7 @@ impl ValidFor {
 }
 
 /// Median of the finite values; 0 if there are none.
-fn median(values: impl Iterator<Item = f32>) -> f64 {
+pub(super) fn median(values: impl Iterator<Item = f32>) -> f64 {
     let mut values: Vec<f32> = values.filter(|value| value.is_finite()).collect();
     values.sort_by(f32::total_cmp);
     values.get(values.len() / 2).map_or(0.0, |&value| f64::from(value))

@@ -1,5 +1,6 @@
 //! Calibrates a plane rig from images of a white board.
 
+mod drawing;
 mod file;
 mod images;
 mod report;
@@ -17,9 +18,10 @@ use raysweep_transport::plane::board::images::MOST_BEND;
 use raysweep_transport::plane::board::times::RowTimes;
 use raysweep_transport::plane::calibrate::FlyingSpot;
 
+pub use self::drawing::{CalibratedDrawing, Scanning};
 pub use self::file::{
-    CalibratedAmbient, CalibratedDrawing, CalibratedFlicker, CalibrationArrays, CalibrationHeader,
-    KeptCalibration, Pair, Scanning, ValidFor, current_in,
+    CalibratedAmbient, CalibratedFlicker, CalibrationArrays, CalibrationHeader, KeptCalibration, Pair,
+    ValidFor, current_in,
 };
 use self::file::{CalibratedLight, CalibratedTiming, SCHEMA};
 pub use self::images::{BoardImages, BoardPixels, CalibrationError, MeasuredCurve};

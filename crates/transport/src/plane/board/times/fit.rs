@@ -1,9 +1,7 @@
 use nalgebra::{DMatrix, DVector};
-use ndarray::{ArrayView2, ArrayView3};
 
 use super::super::super::NoiseModel;
 use super::super::super::error::check_shape;
-use super::super::super::model::{FlyingSpot, Scan};
 use super::super::Estimate;
 use super::coarse::{Arrivals, CoarseSweep, arrivals, median};
 use super::columns::Columns;
@@ -89,30 +87,6 @@ impl RowTimes {
         fit.steps(MAX_STEPS, false)?;
         fit.check_exposures()?;
         fit.result(jitter_us, residuals)
-    }
-
-    /// The same for rows that are drawn by a flying spot whose direction is unknown, which passes the projector's
-    /// `columns` that pixels see, `[t, s]` in 0..=1. `place` and `response` are those of [`Columns::new`]. `None` if no
-    /// direction explains the frames.
-    ///
-    /// # Errors
-    /// [`TimesError::Direction`] if both do; those of [`Columns::new`].
-    pub fn find_spot(
-        (place, response): (ArrayView2<f32>, ArrayView3<f32>),
-        columns: ArrayView2<f32>,
-        frames: &[BoardFrame],
-        nominal: &Nominal,
-        noise: NoiseModel,
-    ) -> Result<Option<(Self, FlyingSpot)>, TimesError> {
-        let fit = |scan| {
-            let spot = FlyingSpot { scan, columns: columns.to_owned() };
-            let columns = Columns::new(place, response, Some(&spot))?;
-            Ok::<_, TimesError>(Self::fit(&columns, frames, nominal, noise).ok().map(|times| (times, spot)))
-        };
-        match (fit(Scan::OneWay)?, fit(Scan::Bidirectional)?) {
-            (Some(_), Some(_)) => Err(TimesError::Direction),
-            (one_way, bidirectional) => Ok(one_way.or(bidirectional)),
-        }
     }
 }
 

@@ -21,6 +21,7 @@ mod fit;
 mod model;
 mod result;
 mod settings;
+mod spot;
 mod strip;
 mod table;
 
