@@ -57,8 +57,9 @@ impl Player<'_> {
         deliver: &mut (dyn FnMut(Arrival) -> Result<(), FrameRefused> + Send),
     ) -> Result<Vec<Loss>, RunError> {
         let orders = self.orders;
-        let (path_over, camera_over) = (AtomicBool::new(false), AtomicBool::new(false));
         let is_driven = self.motion.is_driven();
+        // Without a mirror, no path goes on after the frames, and the next frame of a recording is the next pass's.
+        let (path_over, camera_over) = (AtomicBool::new(!is_driven), AtomicBool::new(false));
         self.motion.start(path, rounds)?;
         let mut source = Source { camera: &mut *self.camera, pool: &self.pool, pace: self.pace };
         let (pace, is_simulated) = (self.pace, matches!(self.stand, Stand::Simulated(_)));
