@@ -244,7 +244,9 @@ impl<C: PointController> Mirror for PointMirror<C> {
 
 impl<C: PointController> Drop for PointMirror<C> {
     fn drop(&mut self) {
-        if let Err(error) = self.park().and_then(|()| self.controller.release()) {
+        // A mirror that cannot be parked is released all the same: no drive, no light.
+        let (parked, released) = (self.park(), self.controller.release());
+        if let Err(error) = parked.and(released) {
             tracing::error!(%error, "the mirror could not be parked");
         }
     }

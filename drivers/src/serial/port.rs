@@ -88,13 +88,15 @@ impl Port {
 
     /// Writes all bytes.
     pub fn send(&mut self, mut bytes: &[u8]) -> Result<(), DeviceError> {
-        let mut last = Instant::now();
+        let patience = || Timeout::new(SEND_WAIT, 2 * WRITE_WAIT, Instant::now());
+        let mut timeout = patience();
         while !bytes.is_empty() {
+            let is_over = timeout.look(Instant::now());
             let written = self.write_some(bytes)?;
             bytes = &bytes[written..];
             if written > 0 {
-                last = Instant::now();
-            } else if last.elapsed() > SEND_WAIT {
+                timeout = patience();
+            } else if is_over {
                 let what =
                     format!("{} takes no bytes: the controller hangs; switch it off and on", self.name);
                 return Err(DeviceError::new(self.device, DeviceErrorKind::Timeout, what));

@@ -5,6 +5,7 @@
 mod conformance;
 #[path = "../suite/hung.rs"]
 mod hung;
+mod mishaps;
 #[path = "../suite/noise.rs"]
 mod noise;
 mod parsers;

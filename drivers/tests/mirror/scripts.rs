@@ -59,7 +59,7 @@ impl Script {
     }
 
     /// The received lines, without consecutive duplicates: a mirror at rest gets the same command repeatedly.
-    fn lines(&self) -> Vec<String> {
+    pub fn lines(&self) -> Vec<String> {
         let heard = self.heard.lock().unwrap();
         let mut lines: Vec<String> =
             String::from_utf8(heard.clone()).unwrap().lines().map(str::to_owned).collect();
@@ -69,7 +69,7 @@ impl Script {
     }
 }
 
-fn line(bytes: &[u8]) -> Option<usize> {
+pub fn line(bytes: &[u8]) -> Option<usize> {
     bytes.iter().position(|byte| *byte == b'\n').map(|at| at + 1)
 }
 

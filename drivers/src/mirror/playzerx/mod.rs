@@ -19,7 +19,7 @@ use raysweep_core::{
 };
 
 use self::protocol::{FIFO_SAMPLES, PADDING, PlayzerXCommand, PlayzerXReply, SAMPLE_BYTES, parse_response};
-use self::stream::SampleStream;
+use self::stream::{Halted, SampleStream};
 use super::error::{DEVICE, fault};
 use super::light::LightGuard;
 use super::rules;
@@ -246,7 +246,11 @@ impl Mirror for PlayzerX {
                 if let Err(error) = noted {
                     tracing::error!(%error, "a kill in the next milliseconds would leave a wrong place");
                 }
-                (stream.halt(&mut self.port)?, stream.asked_rate_hz())
+                let Some(place) = stream.halt(&mut self.port)? else {
+                    reset(&mut self.port)?;
+                    return self.note_parked();
+                };
+                (place, stream.asked_rate_hz())
             }
         };
         darken(&mut self.port, place, self.config.full_scale)?;
@@ -321,6 +325,16 @@ fn left_of(reply: PlayzerXReply) -> Option<u32> {
     }
 }
 
+/// Parks a mirror of unknown position: the reset switches off light and drive, and the mirror springs back, damped by
+/// the drive's own filter. An error if the controller does not answer afterwards.
+fn reset(port: &mut Port) -> Result<(), DeviceError> {
+    let mut bytes = PADDING.to_vec();
+    PlayzerXCommand::Reset.to_bytes(&mut bytes);
+    port.send(&bytes)?;
+    std::thread::sleep(RESET_WAIT);
+    hello(port).map(drop)
+}
+
 /// Switches the light off at the mirror's position. The FIFO is empty, so the sample is played at once.
 fn darken(port: &mut Port, place: Tilt, full_scale: MechanicalDeg) -> Result<(), DeviceError> {
     let mut bytes = Vec::new();
@@ -343,18 +357,14 @@ pub(super) fn recover(
     let mut port = Port::open(DEVICE, name, BAUD)?;
     // The process may have died with a query pending.
     let is_known = state.is_plugged_in_since(name, *node) && sent != Sent::EMPTIED;
-    let left = if is_known {
+    let halted = if is_known {
         file.note_sent(Sent::EMPTIED).map_err(of_state)?;
         stream::halt(&mut port, 1)?
     } else {
-        None
+        Halted::Unknown
     };
-    let Some(left) = left else {
-        // The reset switches off light and drive; the mirror springs back, damped by the drive's own filter.
-        let mut bytes = PADDING.to_vec();
-        PlayzerXCommand::Reset.to_bytes(&mut bytes);
-        port.send(&bytes)?;
-        std::thread::sleep(RESET_WAIT);
+    let Halted::Left(left) = halted else {
+        reset(&mut port)?;
         return Ok(None);
     };
     // If the process died during a write, the midpoint of what may have been sent is within one write of the truth.

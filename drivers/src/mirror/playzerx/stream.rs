@@ -36,6 +36,8 @@ const HALT_WAIT: Duration = Duration::from_secs(1);
 const QUIET: Duration = Duration::from_millis(3);
 /// Number of position queries: an answer may be lost in garbage, and the FIFO can be emptied only once.
 const QUESTIONS: usize = 3;
+/// A controller that sends more replies than this is not answering.
+const MOST_REPLIES: usize = 64;
 
 /// A query for the samples left.
 struct Question {
@@ -178,10 +180,8 @@ impl SampleStream {
     fn take_answer(&mut self, left: u64) -> Result<(), DeviceError> {
         // An answer without a query, or with an impossible count, is garbage that looks like an answer.
         let Some(Question { asked, sent, .. }) = self.question else { return Ok(()) };
-        let possible =
-            self.began.map_or(0.0, |began| began.elapsed().as_secs_f64()) * self.asked_rate_hz * 1.1 + 2.0;
         let Some(played) =
-            sent.checked_sub(left).filter(|&played| played >= self.played && played as f64 <= possible)
+            sent.checked_sub(left).filter(|&played| played >= self.played && self.can_have_played(played))
         else {
             return Ok(());
         };
@@ -205,6 +205,12 @@ impl SampleStream {
             ));
         }
         Ok(())
+    }
+
+    /// Whether so many samples can have been played by now, by the clock.
+    fn can_have_played(&self, samples: u64) -> bool {
+        let seconds = self.began.map_or(0.0, |began| began.elapsed().as_secs_f64());
+        samples as f64 <= seconds * self.asked_rate_hz * 1.1 + 2.0
     }
 
     /// Whether more samples must follow the first `sent` without a gap.
@@ -236,20 +242,23 @@ impl SampleStream {
     }
 
     /// Empties the FIFO. Returns the mirror's position according to the controller or, if its answers are lost,
-    /// according to the clock.
-    pub fn halt(&mut self, port: &mut Port) -> Result<Tilt, DeviceError> {
+    /// according to the clock; `None` if it is unknown.
+    pub fn halt(&mut self, port: &mut Port) -> Result<Option<Tilt>, DeviceError> {
         let certain = self.certain_now();
         let unanswered = usize::from(self.question.is_some());
         let seconds = self.moved.elapsed().as_secs_f64();
-        let left = halt(port, unanswered)?;
-        let played = match left {
-            Some(left) => certain.saturating_sub(u64::from(left)),
-            None => {
-                let rate_hz = self.rate.rate_hz().unwrap_or(self.asked_rate_hz);
-                (self.played + (seconds * rate_hz) as u64).min(certain)
+        let played = match halt(port, unanswered)? {
+            // A controller that has restarted has forgotten samples that it did not play.
+            Halted::Left(left) => {
+                Some(certain.saturating_sub(u64::from(left))).filter(|&played| self.can_have_played(played))
             }
+            Halted::Uncounted => {
+                let rate_hz = self.rate.rate_hz().unwrap_or(self.asked_rate_hz);
+                Some((self.played + (seconds * rate_hz) as u64).min(certain))
+            }
+            Halted::Unknown => None,
         };
-        Ok(self.sequence.after(played))
+        Ok(played.map(|played| self.sequence.after(played)))
     }
 
     pub fn is_played(&self) -> bool {
@@ -280,28 +289,40 @@ impl SampleStream {
     }
 }
 
-/// Empties the FIFO. Returns how many samples it held just before, if the controller reports it. `unanswered` queries
-/// are still pending.
+/// How a controller was halted.
+pub enum Halted {
+    /// Its FIFO held so many samples just before it was emptied.
+    Left(u32),
+    /// Its FIFO was emptied just now; how many samples it held is lost.
+    Uncounted,
+    /// It confirms nothing: it may empty its FIFO at any later time.
+    Unknown,
+}
+
+/// Empties the FIFO. `unanswered` queries are still pending.
 ///
 /// A controller that sends nothing at all has not processed the command yet, so there is time to wait for it. If it
 /// answers the ping after the queries, it has processed them, and their answers are lost.
-pub fn halt(port: &mut Port, unanswered: usize) -> Result<Option<u32>, DeviceError> {
+pub fn halt(port: &mut Port, unanswered: usize) -> Result<Halted, DeviceError> {
     let mut bytes = PADDING.to_vec();
     (0..QUESTIONS).for_each(|_| PlayzerXCommand::SamplesLeft.to_bytes(&mut bytes));
     PlayzerXCommand::Clear.to_bytes(&mut bytes);
     PlayzerXCommand::Ping.to_bytes(&mut bytes);
     port.send(&bytes)?;
     let (mut answers, mut last) = (0, None);
-    loop {
+    for _ in 0..MOST_REPLIES {
         // The last answer is the closest in time to the clearing.
         let known = last.filter(|_| answers > unanswered);
         let wait = if known.is_some() { QUIET } else { HALT_WAIT };
-        match port.await_reply(wait, parse_response, Some)? {
-            Some(PlayzerXReply::Left(left)) => (answers, last) = (answers + 1, Some(left)),
-            Some(PlayzerXReply::Info { .. }) => {}
-            Some(PlayzerXReply::Alive) | None => return Ok(known),
+        match (port.await_reply(wait, parse_response, Some)?, known) {
+            (Some(PlayzerXReply::Left(left)), _) => (answers, last) = (answers + 1, Some(left)),
+            (Some(PlayzerXReply::Info { .. }), _) => {}
+            (Some(PlayzerXReply::Alive) | None, Some(left)) => return Ok(Halted::Left(left)),
+            (Some(PlayzerXReply::Alive), None) => return Ok(Halted::Uncounted),
+            (None, None) => return Ok(Halted::Unknown),
         }
     }
+    Ok(Halted::Unknown)
 }
 
 /// Fits a straight line through (seconds, samples).
