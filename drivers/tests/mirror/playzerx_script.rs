@@ -239,9 +239,14 @@ fn parking_empties_the_fifo_and_ramps_from_the_sample_that_the_count_tells() {
     mirror.load(&turn(2000, 1000.0)).unwrap();
     mirror.start(2).unwrap();
     feed_until_played(&mut mirror, 700);
-    // The controller stops with 3000 samples left, and works again when it is parked.
-    lab.desk.lock().unwrap().once_cleared = Some(Drain::ByClock(1000.0));
-    lab.drain(Drain::Holds(3000));
+    // The controller stops, and works again when it is parked.
+    let left = {
+        let mut desk = lab.desk.lock().unwrap();
+        let left = desk.left(raysweep_core::Clock::real().now_ns());
+        desk.drain = Drain::Holds(left);
+        desk.once_cleared = Some(Drain::ByClock(1000.0));
+        left
+    };
     mirror.park().unwrap();
     let frames = lab.frames();
     let clearing = frames.iter().position(|frame| frame == CLEAR).unwrap();
@@ -249,7 +254,7 @@ fn parking_empties_the_fifo_and_ramps_from_the_sample_that_the_count_tells() {
     assert_eq!(frames[clearing - 3..clearing], [LEFT, LEFT, LEFT]);
     assert_eq!(frames[clearing + 1], PING);
     let (before, after) = (samples(&frames[..clearing]), samples(&frames[clearing..]));
-    let place = &before[before.len() - 3000 - 1];
+    let place = &before[before.len() - left as usize - 1];
     assert_ne!(place, AT_ORIGIN);
     assert_eq!(&after[0], place, "dark where it stands");
     assert_eq!(after.last().unwrap(), AT_ORIGIN);
