@@ -1,6 +1,5 @@
 //! `cargo xtask demo`: the paper's sweep on the simulated rig, through the real daemon and its client.
 
-use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Instant;
 
@@ -35,15 +34,5 @@ pub fn demo() -> Done {
     daemon.stop()?;
 
     println!("built in {built_s:.0} s, ran in {run_s:.1} s");
-    println!("report: {}", newest(&data)?.join("report.html").display());
     Ok(())
-}
-
-/// The newest session; session names begin with the time.
-fn newest(data: &Path) -> Done<PathBuf> {
-    let folders = std::fs::read_dir(data).map_err(|error| format!("{}: {error}", data.display()))?;
-    let reported =
-        folders.flatten().map(|folder| folder.path()).filter(|path| path.join("report.html").exists());
-    let newest = reported.max();
-    newest.ok_or_else(|| format!("{}: no session with a report", data.display()))
 }

@@ -86,8 +86,10 @@ impl Tally {
 
     /// Figures and warnings, and the findings.
     pub(super) fn summary(self, findings: Findings) -> SweepSummary {
-        let mut figures =
-            vec![("images demultiplexed", self.images as f64), ("saturated pixels", self.saturated as f64)];
+        let mut figures = vec![
+            ("images demultiplexed, captures included", self.images as f64),
+            ("saturated pixels", self.saturated as f64),
+        ];
         if self.saturated > 0 {
             figures.push(("pixels known only as lower bounds", self.bounds as f64));
         }

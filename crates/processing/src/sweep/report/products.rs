@@ -26,7 +26,7 @@ pub(super) fn images(products: &[Product], markers: &[Marker]) -> Option<Section
         .collect();
     (!pictures.is_empty()).then(|| Section {
         title: "Light by where it came from".into(),
-        intro: "Each picture has its own scale; 1 is a white surface lit by its own projector row. The crosses are the pixels of the profiles below. Where pixels are hatched, the light is only known to be at least what is shown: they saturate.".into(),
+        intro: "The projector draws its rows one after the other, so the camera can tell which row's light it sees. Light from the row that lights a pixel directly is at u = 0; u counts rows from there, and all other light was reflected or scattered on its way. Camera rows are t, columns are s. Each picture has its own scale; 1 is a white surface lit by its own projector row. The crosses are the pixels of the profiles below. Where pixels are hatched, the light is only known to be at least what is shown: they saturate.".into(),
         blocks: vec![Block::Pictures(pictures)],
     })
 }
