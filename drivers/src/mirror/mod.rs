@@ -2,7 +2,8 @@
 //!
 //! A driver keeps a [`StateFile`]: what it is going to send is on disk before the first sample is sent, and how much
 //! of it was sent is recorded next to it. After a crash, [`park()`], a [`Guardian`] or the next run can therefore
-//! determine the mirror's position and move it to the origin, light off first.
+//! determine the mirror's position and move it to the origin, light off first. Where it cannot be determined, the drive
+//! is switched off.
 
 mod error;
 mod greet;

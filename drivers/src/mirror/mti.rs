@@ -193,12 +193,20 @@ impl PointMirror<MtiLine> {
     }
 }
 
-/// Parks a mirror that a process left behind. `None`: its drive was off, so it is at rest.
-pub(super) fn recover(state: &MirrorState, sent: Sent) -> Result<Option<Tilt>, DeviceError> {
+/// Parks a mirror that a process left behind. `None`: its drive was off or is switched off, so that it springs back.
+pub(super) fn recover(
+    file: &StateFile,
+    state: &MirrorState,
+    sent: Sent,
+) -> Result<Option<Tilt>, DeviceError> {
     let Reach::Mti { port, full_scale } = &state.reach else { return Ok(None) };
     let (mut line, _) = MtiLine::enter(port, *full_scale)?;
-    match points::recover(&mut line, state, sent) {
-        Err(error) if error.kind == DeviceErrorKind::Protocol => Ok(None),
+    if sent == Sent::UNKNOWN {
+        return line.release().map(|()| None);
+    }
+    match points::recover(&mut line, file, state, sent) {
+        // A drive that is off refuses points, but not only such a one does.
+        Err(error) if error.kind == DeviceErrorKind::Protocol => line.release().map(|()| None),
         recovered => recovered,
     }
 }

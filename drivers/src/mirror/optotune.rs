@@ -225,19 +225,23 @@ impl Laser for NoLaser {
 }
 
 /// Parks a mirror that a process left behind. `None`: it may not have been where it was left.
-pub(super) fn recover(state: &MirrorState, sent: Sent) -> Result<Option<Tilt>, DeviceError> {
+pub(super) fn recover(
+    file: &StateFile,
+    state: &MirrorState,
+    sent: Sent,
+) -> Result<Option<Tilt>, DeviceError> {
     let Reach::Optotune { port, node, laser_port } = &state.reach else { return Ok(None) };
     let laser: Box<dyn Laser> = match laser_port {
         Some(port) => Box::new(RtsLaser::open(port)?),
         None => Box::new(NoLaser),
     };
     let mut line = OptotuneLine::open(port, laser)?;
-    if !state.is_plugged_in_since(port, *node) {
+    if sent == Sent::UNKNOWN || !state.is_plugged_in_since(port, *node) {
         // Without power, it has sprung back. With power, its own control loop follows a step of any size.
         line.go(MirrorPoint { tilt: Tilt::ORIGIN, light: 0 })?;
         return Ok(None);
     }
-    points::recover(&mut line, state, sent)
+    points::recover(&mut line, file, state, sent)
 }
 
 #[cfg(test)]

@@ -60,8 +60,8 @@ pub(super) fn park_left(file: &StateFile) -> Result<Parked, ParkError> {
     let found = loop {
         let recovered = match &state.reach {
             Reach::PlayzerX { .. } => playzerx::recover(file, &state, sent),
-            Reach::Mti { .. } => mti::recover(&state, sent),
-            Reach::Optotune { .. } => optotune::recover(&state, sent),
+            Reach::Mti { .. } => mti::recover(file, &state, sent),
+            Reach::Optotune { .. } => optotune::recover(file, &state, sent),
         };
         match recovered {
             Err(error) if error.kind == DeviceErrorKind::Busy && Instant::now() < deadline => {

@@ -197,8 +197,16 @@ impl<C: PointController> PointMirror<C> {
     fn park_after(&mut self, error: DeviceError) -> DeviceError {
         if let Err(second) = self.park() {
             tracing::error!(error = %second, "the mirror could not be parked");
+            self.release();
         }
         error
+    }
+
+    /// Releases the mirror, parked or not.
+    fn release(&mut self) {
+        if let Err(error) = self.controller.release() {
+            tracing::error!(%error, "the mirror could not be released: its drive and its light may be on");
+        }
     }
 }
 
@@ -232,10 +240,14 @@ impl<C: PointController> Mirror for PointMirror<C> {
             Phase::Ready(path) => (path.at(0).tilt, path.rate_hz()),
             Phase::Moving(pace) => (pace.sequence.after(pace.sent), 1.0 / pace.period.as_secs_f64()),
         };
+        self.state.note_unknown();
         self.controller.go(MirrorPoint { tilt: place, light: 0 })?;
         let sequence = Sequence::travel(place, Tilt::ORIGIN, rate_hz, &self.capabilities.limits);
         // A full disk must not prevent parking.
         let recorded = self.record(rate_hz, Some(&sequence));
+        if recorded.is_err() {
+            self.state.note_unknown();
+        }
         self.play_out(sequence, rate_hz, recorded.is_ok())?;
         self.phase = Phase::Parked;
         self.record(1.0, None).and(recorded)
@@ -244,21 +256,23 @@ impl<C: PointController> Mirror for PointMirror<C> {
 
 impl<C: PointController> Drop for PointMirror<C> {
     fn drop(&mut self) {
-        // A mirror that cannot be parked is released all the same: no drive, no light.
-        let (parked, released) = (self.park(), self.controller.release());
-        if let Err(error) = parked.and(released) {
+        if let Err(error) = self.park() {
             tracing::error!(%error, "the mirror could not be parked");
         }
+        self.release();
     }
 }
 
 /// Moves a mirror that a process left behind to the origin, dark. Returns where it was found.
 pub(super) fn recover<C: PointController>(
     controller: &mut C,
+    file: &StateFile,
     state: &MirrorState,
     sent: Sent,
 ) -> Result<Option<Tilt>, DeviceError> {
     let Some(sequence) = &state.playing else { return Ok(None) };
+    // Whoever comes after a kill on the way home finds the mirror on that way.
+    file.note_unknown();
     // The controller may or may not have taken the last point; the two cases are one step apart, which is safe for
     // any mirror.
     let place = sequence.after(sent.possibly);

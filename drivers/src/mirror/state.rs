@@ -3,8 +3,10 @@
 //! `NAME` contains the sequence; it is written, fsynced and renamed before the first sample is sent. `NAME.sent`
 //! contains three numbers: samples that have certainly left the process, samples that may have left it, and the number
 //! of the sequence that they belong to; of any other sequence, none has left. So a process that is killed between the
-//! writes of the two files leaves a state that is true. It is written before and after each write to the port, without
-//! fsync: it only has to survive the process, and a crash of the machine is detected by the boot id. `NAME.lock` is locked by the process that drives the mirror.
+//! writes of the two files leaves a state that is true. `NAME.sent` is written before and after each write to the port,
+//! without fsync: it only has to survive the process, and a crash of the machine is detected by the boot id. Before a
+//! mirror is moved from a place that the files do not tell, it says so. `NAME.lock` is locked by the process that
+//! drives the mirror.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -105,8 +107,8 @@ pub(super) struct Sent {
 }
 
 impl Sent {
-    /// The controller's FIFO may have been emptied since: what was sent does not tell the place any more.
-    pub const EMPTIED: Self = Self { certainly: u64::MAX, possibly: u64::MAX };
+    /// What was sent does not tell the place any more.
+    pub const UNKNOWN: Self = Self { certainly: u64::MAX, possibly: u64::MAX };
 }
 
 /// The files of one mirror, locked.
@@ -177,6 +179,14 @@ impl StateFile {
         };
         write().map_err(StateError::io("write", &self.path))?;
         self.note_sent(Sent { certainly: 0, possibly: 0 })
+    }
+
+    /// Records that the files do not tell the mirror's place from now on. A disk that does not take this must not keep
+    /// anybody from parking.
+    pub(super) fn note_unknown(&self) {
+        if let Err(error) = self.note_sent(Sent::UNKNOWN) {
+            tracing::error!(%error, "a kill in the next moments would leave a wrong place");
+        }
     }
 
     /// Records how much was sent.

@@ -4,6 +4,7 @@ use std::time::{Duration, Instant};
 
 /// Minimum number of looks before a timeout is over.
 const LOOKS: u32 = 16;
+
 /// A timeout of which each look uses up little, so that a host that stands still or is busy does not use it up.
 #[derive(Debug)]
 pub(crate) struct Timeout {

@@ -67,7 +67,6 @@ impl Player<'_> {
         let wanted = || {
             let is_over = match is_driven {
                 true => path_over.load(Ordering::Relaxed),
-                // The next frame of a recording belongs to another pass.
                 false => enough.load(Ordering::Relaxed) || taken.load(Ordering::Relaxed) >= frames,
             };
             match (orders.go_on(), is_over) {
@@ -125,8 +124,17 @@ impl Player<'_> {
             }
             Ok((fed, camera.join()))
         })?;
-        if let (Err(_) | Ok(Err(_)), Ok(Err(error))) = (&fed, &taken) {
-            tracing::error!(%error, "the camera failed as well as the mirror");
+        match (&fed, &taken) {
+            (Err(_) | Ok(Err(_)), Ok(Err(error))) => {
+                tracing::error!(%error, "the camera failed as well as the mirror");
+            }
+            (Err(_) | Ok(Err(_)), Err(panic)) => {
+                tracing::error!(
+                    panic = message_of(&**panic),
+                    "the camera's thread failed as well as the mirror"
+                );
+            }
+            _ => {}
         }
         fed.map_err(panicked)??;
         Ok(taken.map_err(panicked)??)

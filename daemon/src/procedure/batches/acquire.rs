@@ -270,9 +270,12 @@ impl DotPasses<'_> {
             ));
         }
         drop(input);
-        let Gathered { sink, background, error } = flow.join()?;
+        let gathered = flow.join();
+        // An error of the mirror says more than what follows from it in the workers.
+        let lost = played?;
+        let Gathered { sink, background, error } = gathered?;
         let mut rest = Counts::default();
-        for Loss { frames, cause } in played? {
+        for Loss { frames, cause } in lost {
             rest.expected += frames;
             rest.lose(cause, frames);
         }

@@ -19,7 +19,7 @@ use raysweep_core::{
 };
 
 use self::protocol::{FIFO_SAMPLES, PADDING, PlayzerXCommand, PlayzerXReply, SAMPLE_BYTES, parse_response};
-use self::stream::{Halted, SampleStream};
+use self::stream::SampleStream;
 use super::error::{DEVICE, fault};
 use super::light::LightGuard;
 use super::rules;
@@ -75,6 +75,8 @@ enum Phase {
     Ready(MirrorPath),
     /// Samples are being played.
     Moving(Box<SampleStream>),
+    /// Anywhere: the controller did not do what it was told.
+    Lost,
 }
 
 impl PlayzerX {
@@ -237,26 +239,29 @@ impl Mirror for PlayzerX {
     }
 
     fn park(&mut self) -> Result<(), DeviceError> {
-        let (place, rate_hz) = match &mut self.phase {
-            Phase::Parked => return Ok(()),
-            Phase::Ready(path) => (path.at(0).tilt, path.rate_hz()),
-            Phase::Moving(stream) => {
-                // Who is killed before the travel is recorded leaves a place that nobody can know.
-                let noted = self.state.note_sent(Sent::EMPTIED);
-                if let Err(error) = noted {
-                    tracing::error!(%error, "a kill in the next milliseconds would leave a wrong place");
-                }
-                let Some(place) = stream.halt(&mut self.port)? else {
-                    reset(&mut self.port)?;
-                    return self.note_parked();
-                };
-                (place, stream.asked_rate_hz())
+        if let Phase::Parked = self.phase {
+            return Ok(());
+        }
+        self.state.note_unknown();
+        // The place is told once: whoever asks again after an error hears of a FIFO that was emptied.
+        let halted = match std::mem::replace(&mut self.phase, Phase::Lost) {
+            Phase::Parked | Phase::Lost => None,
+            Phase::Ready(path) => Some((path.at(0).tilt, path.rate_hz())),
+            Phase::Moving(mut stream) => {
+                stream.halt(&mut self.port)?.map(|place| (place, stream.asked_rate_hz()))
             }
+        };
+        let Some((place, rate_hz)) = halted else {
+            reset(&mut self.port)?;
+            return self.note_parked();
         };
         darken(&mut self.port, place, self.config.full_scale)?;
         let sequence = Sequence::travel(place, Tilt::ORIGIN, rate_hz, &self.config.limits);
         // A full disk must not prevent parking.
         let recorded = self.record(&sequence, rate_hz);
+        if recorded.is_err() {
+            self.state.note_unknown();
+        }
         self.play_out(sequence, rate_hz, recorded.is_ok())?;
         self.note_parked().and(recorded)
     }
@@ -330,9 +335,19 @@ fn left_of(reply: PlayzerXReply) -> Option<u32> {
 fn reset(port: &mut Port) -> Result<(), DeviceError> {
     let mut bytes = PADDING.to_vec();
     PlayzerXCommand::Reset.to_bytes(&mut bytes);
-    port.send(&bytes)?;
-    std::thread::sleep(RESET_WAIT);
-    hello(port).map(drop)
+    let send = |port: &mut Port| {
+        port.send(&bytes)?;
+        std::thread::sleep(RESET_WAIT);
+        hello(port)
+    };
+    // A controller that hangs may lose what it is sent: only a reset of one that answers is believed.
+    let answers = hello(port).is_ok();
+    let answered = send(port)?;
+    if !answers {
+        send(port)?;
+    }
+    tracing::warn!(controller = answered, "reset, because nothing told where the mirror was");
+    Ok(())
 }
 
 /// Switches the light off at the mirror's position. The FIFO is empty, so the sample is played at once.
@@ -355,15 +370,12 @@ pub(super) fn recover(
         return Ok(None);
     };
     let mut port = Port::open(DEVICE, name, BAUD)?;
+    let is_known = state.is_plugged_in_since(name, *node) && sent != Sent::UNKNOWN;
+    file.note_unknown();
     // The process may have died with a query pending.
-    let is_known = state.is_plugged_in_since(name, *node) && sent != Sent::EMPTIED;
-    let halted = if is_known {
-        file.note_sent(Sent::EMPTIED).map_err(of_state)?;
-        stream::halt(&mut port, 1)?
-    } else {
-        Halted::Unknown
-    };
-    let Halted::Left(left) = halted else {
+    let left = if is_known { stream::halt(&mut port, 1)? } else { None };
+    // A FIFO that ran dry looks like that of a controller that restarted.
+    let Some(left) = left.filter(|&left| left > 0 && u64::from(left) <= sent.possibly) else {
         reset(&mut port)?;
         return Ok(None);
     };
@@ -373,10 +385,13 @@ pub(super) fn recover(
     darken(&mut port, place, *full_scale)?;
     let sequence = Sequence::travel(place, Tilt::ORIGIN, state.rate_hz, &state.limits);
     let travelling = MirrorState { playing: Some(sequence.clone()), ..state.clone() };
-    file.write(&travelling).map_err(of_state)?;
+    let recorded = file.write(&travelling).map_err(of_state);
+    if recorded.is_err() {
+        file.note_unknown();
+    }
     let mut stream = SampleStream::new(sequence, state.rate_hz, *full_scale);
-    play_out(&mut stream, &mut port, Some(file))?;
-    Ok(Some(place))
+    play_out(&mut stream, &mut port, recorded.is_ok().then_some(file))?;
+    recorded.map(|()| Some(place))
 }
 
 /// Sends samples and reads replies until all are played.

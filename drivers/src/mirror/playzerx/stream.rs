@@ -26,7 +26,7 @@ const SPARE_SAMPLES: u64 = 1000;
 const ASK_EVERY: Duration = Duration::from_millis(10);
 /// The time of an answer with a longer round trip is too uncertain.
 const LONGEST_ROUND_TRIP: Duration = Duration::from_millis(5);
-/// Maximum time for an answer while the FIFO, of three seconds, plays on.
+/// Maximum time for an answer while the FIFO, of three seconds, plays on; after it, no more samples are sent.
 const ANSWER_WAIT: Duration = Duration::from_secs(1);
 /// The longest time between two steps of a host that is not busy.
 const STEP: Duration = Duration::from_millis(20);
@@ -129,8 +129,9 @@ impl SampleStream {
         self.written = 0;
         let (asked_after, left) = self.answer;
         let held_at_most = left + (self.next - asked_after);
-        // Samples sent to a FIFO that ran dry would hide the gap.
-        let is_in_doubt = self.may_have_run_dry();
+        // Samples sent to a FIFO that ran dry would hide the gap; to a controller that restarted, they would be a step.
+        let is_late = self.question.as_ref().is_some_and(|question| question.asked.elapsed() > ANSWER_WAIT);
+        let is_in_doubt = is_late || self.may_have_run_dry();
         let room = match is_in_doubt {
             true => 0,
             false => (u64::from(FIFO_SAMPLES) - SPARE_SAMPLES).saturating_sub(held_at_most),
@@ -180,11 +181,7 @@ impl SampleStream {
     fn take_answer(&mut self, left: u64) -> Result<(), DeviceError> {
         // An answer without a query, or with an impossible count, is garbage that looks like an answer.
         let Some(Question { asked, sent, .. }) = self.question else { return Ok(()) };
-        let Some(played) =
-            sent.checked_sub(left).filter(|&played| played >= self.played && self.can_have_played(played))
-        else {
-            return Ok(());
-        };
+        let Some(played) = self.played_of(sent, left) else { return Ok(()) };
         self.question = None;
         (self.answer, self.answer_asked) = ((sent, left), asked);
         if played > self.played {
@@ -207,10 +204,11 @@ impl SampleStream {
         Ok(())
     }
 
-    /// Whether so many samples can have been played by now, by the clock.
-    fn can_have_played(&self, samples: u64) -> bool {
-        let seconds = self.began.map_or(0.0, |began| began.elapsed().as_secs_f64());
-        samples as f64 <= seconds * self.asked_rate_hz * 1.1 + 2.0
+    /// Samples played, of the first `sent`, if `left` are left; `None` if that cannot be, by the clock.
+    fn played_of(&self, sent: u64, left: u64) -> Option<u64> {
+        let since = self.began.map_or(Duration::ZERO, |began| self.answer_asked.max(began).elapsed());
+        let most = self.played as f64 + since.as_secs_f64() * self.asked_rate_hz * 1.1 + 2.0;
+        sent.checked_sub(left).filter(|&played| played >= self.played && played as f64 <= most)
     }
 
     /// Whether more samples must follow the first `sent` without a gap.
@@ -241,23 +239,13 @@ impl SampleStream {
         Ok(())
     }
 
-    /// Empties the FIFO. Returns the mirror's position according to the controller or, if its answers are lost,
-    /// according to the clock; `None` if it is unknown.
+    /// Empties the FIFO. Returns the mirror's position according to the controller; `None` if it does not tell it.
     pub fn halt(&mut self, port: &mut Port) -> Result<Option<Tilt>, DeviceError> {
         let certain = self.certain_now();
         let unanswered = usize::from(self.question.is_some());
-        let seconds = self.moved.elapsed().as_secs_f64();
-        let played = match halt(port, unanswered)? {
-            // A controller that has restarted has forgotten samples that it did not play.
-            Halted::Left(left) => {
-                Some(certain.saturating_sub(u64::from(left))).filter(|&played| self.can_have_played(played))
-            }
-            Halted::Uncounted => {
-                let rate_hz = self.rate.rate_hz().unwrap_or(self.asked_rate_hz);
-                Some((self.played + (seconds * rate_hz) as u64).min(certain))
-            }
-            Halted::Unknown => None,
-        };
+        let left = halt(port, unanswered)?;
+        // A controller that restarted has forgotten samples that it cannot have played yet.
+        let played = left.and_then(|left| self.played_of(certain, left.into()));
         Ok(played.map(|played| self.sequence.after(played)))
     }
 
@@ -289,21 +277,12 @@ impl SampleStream {
     }
 }
 
-/// How a controller was halted.
-pub enum Halted {
-    /// Its FIFO held so many samples just before it was emptied.
-    Left(u32),
-    /// Its FIFO was emptied just now; how many samples it held is lost.
-    Uncounted,
-    /// It confirms nothing: it may empty its FIFO at any later time.
-    Unknown,
-}
-
-/// Empties the FIFO. `unanswered` queries are still pending.
+/// Empties the FIFO. Returns how many samples it held just before; `None` if the controller does not tell it, and may
+/// empty it at any later time. `unanswered` queries are still pending.
 ///
 /// A controller that sends nothing at all has not processed the command yet, so there is time to wait for it. If it
 /// answers the ping after the queries, it has processed them, and their answers are lost.
-pub fn halt(port: &mut Port, unanswered: usize) -> Result<Halted, DeviceError> {
+pub fn halt(port: &mut Port, unanswered: usize) -> Result<Option<u32>, DeviceError> {
     let mut bytes = PADDING.to_vec();
     (0..QUESTIONS).for_each(|_| PlayzerXCommand::SamplesLeft.to_bytes(&mut bytes));
     PlayzerXCommand::Clear.to_bytes(&mut bytes);
@@ -314,15 +293,13 @@ pub fn halt(port: &mut Port, unanswered: usize) -> Result<Halted, DeviceError> {
         // The last answer is the closest in time to the clearing.
         let known = last.filter(|_| answers > unanswered);
         let wait = if known.is_some() { QUIET } else { HALT_WAIT };
-        match (port.await_reply(wait, parse_response, Some)?, known) {
-            (Some(PlayzerXReply::Left(left)), _) => (answers, last) = (answers + 1, Some(left)),
-            (Some(PlayzerXReply::Info { .. }), _) => {}
-            (Some(PlayzerXReply::Alive) | None, Some(left)) => return Ok(Halted::Left(left)),
-            (Some(PlayzerXReply::Alive), None) => return Ok(Halted::Uncounted),
-            (None, None) => return Ok(Halted::Unknown),
+        match port.await_reply(wait, parse_response, Some)? {
+            Some(PlayzerXReply::Left(left)) => (answers, last) = (answers + 1, Some(left)),
+            Some(PlayzerXReply::Info { .. }) => {}
+            Some(PlayzerXReply::Alive) | None => return Ok(known),
         }
     }
-    Ok(Halted::Unknown)
+    Ok(None)
 }
 
 /// Fits a straight line through (seconds, samples).
