@@ -17,7 +17,8 @@ pub struct CalibrationPlan {
     pub picture_frames: u32,
     /// Largest number of passes of the beam in the exposures that show how linear the camera is; 0: none are taken.
     pub passes: u32,
-    /// Delays at which the arrival of each row's light is measured, with three frames each.
+    /// Delays at which the arrival of each row's light is measured: once over all at which it may come, twice over those
+    /// at which it does.
     pub delays: u32,
     /// Frames whose measured delay deviates by more than this are dropped.
     pub max_jitter_us: f64,

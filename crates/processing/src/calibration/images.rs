@@ -12,7 +12,9 @@ use raysweep_transport::plane::board::images::{
     PhotonTransfer, Responses, RowPlaces, SensorNoise, WhiteMap, ambient, locate_columns, locate_rows,
     photon_transfer, prnu, steady,
 };
-use raysweep_transport::plane::board::times::{BoardFrame, CoarseSweep, Columns, RowTimes, TimesError};
+use raysweep_transport::plane::board::times::{
+    BoardFrame, CoarseSweep, Columns, RollingSweep, RowTimes, TimesError,
+};
 use raysweep_transport::plane::calibrate::FlyingSpot;
 use raysweep_transport::plane::{NoiseModel, PlaneError};
 
@@ -321,6 +323,16 @@ impl BoardPixels {
         images: &BoardImages<'_>,
         purpose: BoardPurpose,
     ) -> Result<Vec<BoardFrame>, CalibrationError> {
+        self.first_board_frames(images, purpose, usize::MAX)
+    }
+
+    /// The first ones of them.
+    fn first_board_frames(
+        &self,
+        images: &BoardImages<'_>,
+        purpose: BoardPurpose,
+        count: usize,
+    ) -> Result<Vec<BoardFrame>, CalibrationError> {
         let frame = |ordinal| {
             let (image, entry) = images.image(ordinal)?;
             let image = self.curve.straightened(image.insert_axis(Axis(0)), &self.dark);
@@ -332,7 +344,7 @@ impl BoardPixels {
             let setting = images.task.board_setting(purpose, entry);
             Ok(BoardFrame { setting, light: self.columns.average(light.view())? })
         };
-        images.task.ordinals(purpose).map(frame).collect()
+        images.task.ordinals(purpose).take(count).map(frame).collect()
     }
 
     /// The sweep, to within 10 us.
@@ -342,6 +354,20 @@ impl BoardPixels {
     pub fn coarse(&self, images: &BoardImages<'_>) -> Result<CoarseSweep, CalibrationError> {
         let frames = self.board_frames(images, BoardPurpose::SweepTime)?;
         Ok(CoarseSweep::from_borders(&self.columns, &frames, &images.task.nominal())?)
+    }
+
+    /// The sweep as rolling frames see it, from the first pass over the arrivals of light.
+    ///
+    /// # Errors
+    /// When an image is missing, or light does not arrive in these frames.
+    pub fn rolling(
+        &self,
+        images: &BoardImages<'_>,
+        coarse: &CoarseSweep,
+    ) -> Result<RollingSweep, CalibrationError> {
+        let first = images.task.calibration.delays as usize;
+        let frames = self.first_board_frames(images, BoardPurpose::Arrival, first)?;
+        Ok(RollingSweep::from_arrivals(&self.columns, &frames, coarse)?)
     }
 
     /// When each row is lit, and by which spot unless it is lit evenly.

@@ -10,8 +10,8 @@ use raysweep_session::ledger::PointEntry;
 use raysweep_session::stack::Contents;
 use raysweep_transport::plane::PlaneError;
 use raysweep_transport::plane::board::times::{
-    BoardSetting, CoarseSweep, Columns, ExposureMode, Nominal, arrival_settings, check_settings,
-    sweep_settings,
+    BoardSetting, CoarseSweep, Columns, ExposureMode, Nominal, RollingSweep, arrival_settings,
+    check_settings, sweep_settings,
 };
 
 use crate::plane::{KnownRig, PlaneTask};
@@ -74,8 +74,8 @@ pub(super) const AMBIENT_US: f64 = 1200.0;
 const BEFORE_LIGHT_US: f64 = 1600.0;
 /// Global exposures that show when the rows are lit.
 const SWEEP_TIMES: usize = 24;
-/// Frames of each arrival's delay.
-const ARRIVAL_FRAMES: usize = 3;
+/// Passes over the delays at which light arrives: the first one finds them.
+const ARRIVAL_PASSES: usize = 3;
 /// Long exposures that check the short one.
 const EXPOSURE_CHECKS: usize = 24;
 /// Frames of each grey.
@@ -87,7 +87,7 @@ pub struct CalibrationTask {
     /// The plan's own table.
     pub calibration: CalibrationPlan,
     /// Its points, with settings as foreseen from the rig file. Those of the last three purposes follow from images
-    /// taken before them: see [`Self::sweep_times`] and [`Self::arrivals`].
+    /// taken before them: see [`Self::sweep_times`], [`Self::first_arrivals`] and [`Self::arrivals`].
     pub task: Arc<PlaneTask>,
     /// The purpose of each point.
     purposes: Vec<BoardPurpose>,
@@ -267,30 +267,55 @@ impl CalibrationTask {
         Ok(self.points_at(BoardPurpose::SweepTime, settings))
     }
 
-    /// The points that show when each row's light arrives and how long exposures are, once the sweep is known to
-    /// within 10 us.
+    /// The points of a first pass over all times at which each row's light may arrive, once the sweep is known to within
+    /// 10 us: those of later passes follow from them.
     ///
     /// # Errors
     /// Those of [`arrival_settings`].
-    pub fn arrivals(&self, columns: &Columns, coarse: &CoarseSweep) -> Result<Vec<(u32, Point)>, PlaneError> {
+    pub fn first_arrivals(
+        &self,
+        columns: &Columns,
+        coarse: &CoarseSweep,
+    ) -> Result<Vec<(u32, Point)>, PlaneError> {
         let nominal = self.nominal();
-        let half_rows = arrival_settings(columns, coarse, &nominal)?;
-        let [first, .., last] = half_rows[..] else { return Ok(Vec::new()) };
+        let rolling = RollingSweep::foreseen(coarse, &nominal, columns.rows());
+        let settings = arrival_settings(columns, &rolling, &nominal, self.calibration.delays as usize)?;
+        Ok(self.points_at(BoardPurpose::Arrival, settings))
+    }
+
+    /// The points of the later passes, which show when each row's light arrives, and those that show how long exposures
+    /// are.
+    ///
+    /// # Errors
+    /// Those of [`arrival_settings`].
+    pub fn arrivals(
+        &self,
+        columns: &Columns,
+        rolling: &RollingSweep,
+    ) -> Result<Vec<(u32, Point)>, PlaneError> {
+        let nominal = self.nominal();
         let delays = self.calibration.delays as usize;
-        let step_us = (last.delay_us - first.delay_us) / (delays - 1) as f64;
         // Each delay once before any comes again: drift does not look like a delay.
-        let settings = (0..ARRIVAL_FRAMES * delays).map(|index| BoardSetting {
-            delay_us: first.delay_us + step_us * (index % delays) as f64,
-            ..first
-        });
-        let mut points = self.points_at(BoardPurpose::Arrival, settings.collect());
-        points
-            .extend(self.points_at(BoardPurpose::ExposureCheck, check_settings(columns, coarse, &nominal)?));
+        let pass = arrival_settings(columns, rolling, &nominal, delays)?;
+        let passes = pass.iter().cycle().take((ARRIVAL_PASSES - 1) * delays).copied().collect();
+        let checks = check_settings(columns, rolling, &nominal)?;
+        let mut points = self.points_after(BoardPurpose::Arrival, delays, passes);
+        points.extend(self.points_at(BoardPurpose::ExposureCheck, checks));
         Ok(points)
     }
 
     /// The points of a purpose with these settings.
     fn points_at(&self, purpose: BoardPurpose, settings: Vec<BoardSetting>) -> Vec<(u32, Point)> {
+        self.points_after(purpose, 0, settings)
+    }
+
+    /// The points of a purpose after the first ones, with these settings.
+    fn points_after(
+        &self,
+        purpose: BoardPurpose,
+        first: usize,
+        settings: Vec<BoardSetting>,
+    ) -> Vec<(u32, Point)> {
         let geometry = &self.task.geometry;
         let point = |(ordinal, setting): (u32, BoardSetting)| {
             let BoardSetting { delay_us, exposure_us, .. } = setting;
@@ -298,7 +323,7 @@ impl CalibrationTask {
             let foreseen = self.task.schedule.points[ordinal as usize];
             (ordinal, Point { delay_us, exposure_us, ..foreseen })
         };
-        self.ordinals(purpose).zip(settings).map(point).collect()
+        self.ordinals(purpose).skip(first).zip(settings).map(point).collect()
     }
 
     /// The setting of a stored frame, by its measured delay.
@@ -357,7 +382,7 @@ fn purposes(plan: &CalibrationPlan, projector_rows: usize) -> Vec<BoardPurpose> 
         .chain((0..row_codes).map(BoardPurpose::RowCode))
         .chain((0..column_codes).map(BoardPurpose::ColumnCode))
         .chain(several(BoardPurpose::SweepTime, SWEEP_TIMES))
-        .chain(several(BoardPurpose::Arrival, ARRIVAL_FRAMES * plan.delays as usize))
+        .chain(several(BoardPurpose::Arrival, ARRIVAL_PASSES * plan.delays as usize))
         .chain(several(BoardPurpose::ExposureCheck, EXPOSURE_CHECKS))
         .collect()
 }

@@ -34,6 +34,8 @@ pub struct Case {
     pub columns: usize,
     pub row_time_us: f64,
     pub camera_row_time_us: f64,
+    /// How much less the camera says, as a share of it.
+    pub camera_row_error: f64,
     /// How much later than nominal all light is.
     pub latency_us: f64,
     pub mode_offset_us: f64,
@@ -62,6 +64,7 @@ impl Case {
             columns: 12,
             row_time_us: 22.22,
             camera_row_time_us: 22.31,
+            camera_row_error: 0.002,
             latency_us: 8.0,
             mode_offset_us: 6.5,
             exposure_offset_us: 3.2,
@@ -185,13 +188,13 @@ impl Rig {
         }
     }
 
-    /// What is known before the calibration: no latency, an even sweep, row times 0.2 % off.
+    /// What is known before the calibration: no latency, an even sweep, a row time 0.2 % off.
     pub fn nominal(&self) -> Nominal {
         Nominal {
             projector_rows: PROJECTOR_ROWS,
             first_row_us: nominal_first_row_us(),
             row_time_us: self.case.row_time_us * 1.002,
-            camera_row_time_us: self.case.camera_row_time_us * 0.998,
+            camera_row_time_us: self.case.camera_row_time_us * (1.0 - self.case.camera_row_error),
             period_us: PERIOD_US,
         }
     }

@@ -93,7 +93,15 @@ impl BoardAcquisition<'_, '_> {
             return Ok(None);
         }
         let coarse = self.with_images(|images| pixels.coarse(images))?;
-        let arrivals = self.calibration.arrivals(&pixels.columns, &coarse).map_err(CalibrationError::from)?;
+        let first =
+            self.calibration.first_arrivals(&pixels.columns, &coarse).map_err(CalibrationError::from)?;
+        self.acquire(&first)?;
+        if !self.passes.go_on() {
+            return Ok(None);
+        }
+        let rolling = self.with_images(|images| pixels.rolling(images, &coarse))?;
+        let arrivals =
+            self.calibration.arrivals(&pixels.columns, &rolling).map_err(CalibrationError::from)?;
         self.acquire(&arrivals)?;
         Ok(self.passes.go_on().then_some(pixels))
     }

@@ -30,6 +30,8 @@ const BORDER_ERROR_US: f64 = 150.0;
 const PRIOR_US: [f64; 4] = [1e4, 1e4, 500.0, 200.0];
 /// Error of a measured sweep, and how far the shutter modes may be apart.
 const MEASURED_ERROR_US: f64 = 20.0;
+/// How far the camera's row time may be from its nominal value, as a share of it.
+const CAMERA_ROW_ERROR: f64 = 0.04;
 
 impl CoarseSweep {
     /// A sweep of which only the nominal numbers are known.
@@ -101,15 +103,69 @@ impl CoarseSweep {
         self.nominal.start_us(row) + self.late_us.dot(&self.powers(inside)) + slope * (row - inside)
     }
 
-    /// How far a row's light may be from [`Self::time_us`] of a rolling frame.
-    pub(super) fn error_us(&self) -> f64 {
-        self.error_us
-    }
-
     fn powers(&self, row: f64) -> Vector4<f64> {
         let x = (row - self.middle_row) / self.half_rows;
         Vector4::new(1.0, x, x * x, x * x * x)
     }
+}
+
+/// The sweep as rolling frames see it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RollingSweep {
+    coarse: CoarseSweep,
+    camera_row_time_us: f64,
+    /// By how much later light comes to rolling frames than to global ones.
+    later_us: f64,
+    error_us: f64,
+}
+
+impl RollingSweep {
+    /// What global frames tell, before any rolling frame is seen; `camera_rows` are those of the image.
+    pub fn foreseen(coarse: &CoarseSweep, nominal: &Nominal, camera_rows: usize) -> Self {
+        let image_us = camera_rows as f64 * nominal.camera_row_time_us;
+        Self {
+            coarse: *coarse,
+            camera_row_time_us: nominal.camera_row_time_us,
+            later_us: 0.0,
+            error_us: coarse.error_us + CAMERA_ROW_ERROR * image_us,
+        }
+    }
+
+    /// What a first pass of short rolling frames over all delays of [`Self::foreseen`] tells.
+    ///
+    /// # Errors
+    /// [`TimesError::TooFewDelays`], [`TimesError::ArrivalsCut`], [`TimesError::Undetermined`].
+    pub fn from_arrivals(
+        columns: &Columns,
+        frames: &[BoardFrame],
+        coarse: &CoarseSweep,
+    ) -> Result<Self, TimesError> {
+        let points = arrivals(columns, frames)?.points(columns);
+        let (camera_row_time_us, later_us) = clocks(coarse, &points);
+        if !(camera_row_time_us.is_finite() && later_us.is_finite()) {
+            return Err(TimesError::Undetermined);
+        }
+        Ok(Self { coarse: *coarse, camera_row_time_us, later_us, error_us: MEASURED_ERROR_US })
+    }
+
+    /// When light arrives at a place of drawing, counted from the start of a camera row.
+    pub(super) fn time_us(&self, camera_row: usize, place: f64) -> f64 {
+        self.coarse.time_us(place) + self.later_us - camera_row as f64 * self.camera_row_time_us
+    }
+
+    /// How far light may be from [`Self::time_us`].
+    pub(super) fn error_us(&self) -> f64 {
+        self.error_us
+    }
+}
+
+/// The camera's row time, and by how much later light comes to rolling frames, from camera rows, their places and their
+/// arrivals. Sweep minus arrival = rows * camera row time - lateness.
+pub(super) fn clocks(coarse: &CoarseSweep, points: &[(f64, f64, f64)]) -> (f64, f64) {
+    let lines: Vec<(f64, f64)> =
+        points.iter().map(|&(row, place, time_us)| (row, coarse.time_us(place) - time_us)).collect();
+    let (camera_row_us, at_row_0_us) = line(&lines);
+    (camera_row_us, -at_row_0_us)
 }
 
 /// First and last row of some borders.
@@ -171,6 +227,15 @@ pub(super) struct Arrivals {
     /// Centre of each camera row's light, counted from the trigger edge plus the row's own start; `None` if the row is
     /// unlit, or its arrival is not covered.
     pub times_us: Vec<Option<f64>>,
+}
+
+impl Arrivals {
+    /// Camera rows with their places of drawing and their arrivals.
+    pub fn points(&self, columns: &Columns) -> Vec<(f64, f64, f64)> {
+        (0..columns.rows())
+            .filter_map(|row| Some((row as f64, columns.row_place(row)? + 0.5, self.times_us[row]?)))
+            .collect()
+    }
 }
 
 const MIN_DELAYS: usize = 4;
@@ -236,6 +301,27 @@ pub(super) fn arrivals(columns: &Columns, frames: &[BoardFrame]) -> Result<Arriv
     let exposure_offset_us = median(&mut excess_us);
     times_us.iter_mut().flatten().for_each(|time_us| *time_us += exposure_offset_us / 2.0);
     Ok(Arrivals { exposure_us, exposure_offset_us, times_us })
+}
+
+/// Slope, and value at 0, of a line through points; robust against outliers.
+fn line(points: &[(f64, f64)]) -> (f64, f64) {
+    let mut fitted = (0.0, 0.0);
+    let mut scatter = f64::MAX;
+    for _ in 0..10 {
+        let mut sums = [0.0; 5];
+        for &(x, y) in points {
+            let away = (y - fitted.0 * x - fitted.1).abs();
+            let weight = if away > 3.0 * scatter { 0.0 } else { 1.0 };
+            let terms = [weight, weight * x, weight * y, weight * x * x, weight * x * y];
+            sums.iter_mut().zip(terms).for_each(|(sum, term)| *sum += term);
+        }
+        let [n, x, y, xx, xy] = sums;
+        let slope = (n * xy - x * y) / (n * xx - x * x);
+        fitted = (slope, (y - slope * x) / n);
+        let mut away: Vec<f64> = points.iter().map(|&(x, y)| (y - fitted.0 * x - fitted.1).abs()).collect();
+        scatter = 1.4826 * median(&mut away) + 1e-9;
+    }
+    fitted
 }
 
 /// The middle value; 0 without values.

@@ -3,7 +3,7 @@ use nalgebra::{DMatrix, DVector};
 use super::super::super::NoiseModel;
 use super::super::super::error::check_shape;
 use super::super::Estimate;
-use super::coarse::{Arrivals, CoarseSweep, arrivals, median};
+use super::coarse::{Arrivals, CoarseSweep, arrivals, clocks, median};
 use super::columns::Columns;
 use super::error::TimesError;
 use super::model::{BoardSamples, Clocks, ExposureEdge, FrameComparison, Sums, Sweep};
@@ -137,15 +137,9 @@ impl<'a> Fit<'a> {
         coarse: &CoarseSweep,
         arrivals: &Arrivals,
     ) -> Result<Self, TimesError> {
-        // Places of drawing and arrivals, by camera row.
-        let points: Vec<(f64, f64, f64)> = (0..columns.rows())
-            .filter_map(|row| Some((row as f64, columns.row_place(row)? + 0.5, arrivals.times_us[row]?)))
-            .collect();
-        // Sweep minus arrival = rows * camera row time - offset of the modes.
-        let lines: Vec<(f64, f64)> =
-            points.iter().map(|&(row, place, time_us)| (row, coarse.time_us(place) - time_us)).collect();
-        let (camera_row_us, at_row_0_us) = line(&lines);
-        let clocks = [camera_row_us, -at_row_0_us, arrivals.exposure_offset_us];
+        let points = arrivals.points(columns);
+        let (camera_row_us, later_us) = clocks(coarse, &points);
+        let clocks = [camera_row_us, later_us, arrivals.exposure_offset_us];
         let table = SplineTable::new(nominal.projector_rows, &columns.seen_rows());
         // The table through the arrivals; where there are none, through the sweep seen by global frames.
         let count = table.coefficients;
@@ -482,7 +476,8 @@ impl<'a> Fit<'a> {
     /// response of a few columns over many rows. The inverse of the normal matrix alone would be several times too
     /// small. So the scatter of the scores is summed over camera rows, and over blocks of rows in a group of columns,
     /// and what both contain is subtracted (clustered in two ways). Jitters and priors are independent and enter as
-    /// they are.
+    /// they are. A camera row draws the table towards its own error, the more the nearer it is to an end, so its scores
+    /// are those at the unknowns that the other rows give (the jackknife: CR3 of Bell and McCaffrey 2002).
     fn covariance(&self, free: bool) -> Result<DMatrix<f64>, TimesError> {
         let Normal { matrix, frames, .. } = self.normal(free);
         let count = self.unknowns.len();
@@ -492,12 +487,14 @@ impl<'a> Fit<'a> {
         let mut cells = DMatrix::zeros(count, rows * groups);
         let mut by_jitter = DMatrix::zeros(frames.len(), rows * groups);
         let mut jitters = DMatrix::zeros(count, frames.len());
+        let mut information: Vec<Vec<DVector<f64>>> = vec![Vec::new(); rows];
         for (index, own) in frames.iter().enumerate() {
             let frame = &self.frames[own.frame];
             let late = (self.late_us[own.frame], self.longer_us(own.frame));
             jitters.set_column(index, &(&own.mixed / own.weight));
-            comparison.visit(frame, late, BoardSamples::OnEdges, |row, opening, closing, _| {
+            comparison.visit(frame, late, BoardSamples::OnEdges, |row, opening, closing, sums| {
                 let edges = self.edges(own.frame, row, opening, closing);
+                information[row].extend(own.information(&edges, sums));
                 for group in 0..groups {
                     let cell = row * groups + group;
                     let sums = comparison.compare(frame, row, group..group + 1, (opening, closing), false);
@@ -518,15 +515,26 @@ impl<'a> Fit<'a> {
             }
             &sums * sums.transpose()
         };
-        let by_row = summed(rows, &|row, _| row);
         let blocks = rows.div_ceil(BLOCK_ROWS);
         let by_block = summed(blocks * groups, &|row, group| row / BLOCK_ROWS * groups + group);
-        let mut scatter = by_row + by_block - &cells * cells.transpose();
+        let mut scatter = by_block - &cells * cells.transpose();
         scatter += &jitters * jitters.transpose() * self.jitter_prior_us.powi(-2);
         let mut right = DVector::zeros(count);
         self.add_priors(&mut scatter, &mut right, free);
         let inverse = matrix.cholesky().ok_or(TimesError::Undetermined)?.inverse();
-        let covariance = &inverse * scatter * &inverse;
+        let mut covariance = &inverse * scatter * &inverse;
+        for (row, information) in information.iter().enumerate().filter(|(_, of_row)| !of_row.is_empty()) {
+            let score = cells.columns(row * groups, groups).column_sum();
+            let mut change = &inverse * &score;
+            // (A - U U')^-1 s by the formula of Woodbury.
+            let own = DMatrix::from_columns(information);
+            let spread = &inverse * &own;
+            let others = DMatrix::identity(own.ncols(), own.ncols()) - own.tr_mul(&spread);
+            if let Some(others) = others.cholesky() {
+                change += &spread * others.solve(&spread.tr_mul(&score));
+            }
+            covariance.ger(1.0, &change, &change, 1.0);
+        }
         // A difference of sums of squares may be slightly negative.
         let mut eigen = ((&covariance + covariance.transpose()) / 2.0).symmetric_eigen();
         let least = eigen.eigenvalues.amax() * 1e-12;
@@ -662,6 +670,20 @@ impl<'a> Fit<'a> {
 }
 
 impl FrameNormal {
+    /// What the samples of one camera row tell of the unknowns, after the frame's jitter: the sum of the outer products of
+    /// these vectors.
+    fn information(&self, edges: &[Sparse; 2], sums: &Sums) -> [DVector<f64>; 2] {
+        let [opening, closing] = edges.each_ref().map(|edge| {
+            let mut derivative = &self.mixed / self.weight;
+            edge.entries().iter().for_each(|&(a, x)| derivative[a] += x);
+            derivative
+        });
+        let both = sums.opening_square.max(f64::MIN_POSITIVE).sqrt();
+        let of_closing = -sums.mixed / both;
+        let rest = (sums.closing_square - of_closing * of_closing).max(0.0).sqrt();
+        [opening * both + &closing * of_closing, closing * rest]
+    }
+
     /// Adds the samples of one camera row. The light is `closing` minus `opening`, and late light is an early edge.
     fn add(
         &mut self,
@@ -715,27 +737,6 @@ impl Sparse {
             weights.iter().enumerate().for_each(|(index, weight)| self.push(first + index, -share * weight));
         }
     }
-}
-
-/// Slope, and value at 0, of a line through points; robust against outliers.
-fn line(points: &[(f64, f64)]) -> (f64, f64) {
-    let mut fitted = (0.0, 0.0);
-    let mut scatter = f64::MAX;
-    for _ in 0..10 {
-        let mut sums = [0.0; 5];
-        for &(x, y) in points {
-            let away = (y - fitted.0 * x - fitted.1).abs();
-            let weight = if away > 3.0 * scatter { 0.0 } else { 1.0 };
-            let terms = [weight, weight * x, weight * y, weight * x * x, weight * x * y];
-            sums.iter_mut().zip(terms).for_each(|(sum, term)| *sum += term);
-        }
-        let [n, x, y, xx, xy] = sums;
-        let slope = (n * xy - x * y) / (n * xx - x * x);
-        fitted = (slope, (y - slope * x) / n);
-        let mut away: Vec<f64> = points.iter().map(|&(x, y)| (y - fitted.0 * x - fitted.1).abs()).collect();
-        scatter = 1.4826 * median(&mut away) + 1e-9;
-    }
-    fitted
 }
 
 /// Adds the squares of third differences of the coefficients, which begin at `values`, to normal equations.

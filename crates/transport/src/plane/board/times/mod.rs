@@ -7,7 +7,8 @@
 //! modes, what exposures have more than their nominal length, and how late the light of each frame is.
 //!
 //! The order of calls is: [`Columns::new`] from the map of places and the responses; frames of [`sweep_settings`], each
-//! reduced by [`Columns::average`]; [`CoarseSweep::from_borders`]; frames of [`arrival_settings`] and [`check_settings`];
+//! reduced by [`Columns::average`]; [`CoarseSweep::from_borders`]; a pass of frames of [`arrival_settings`] as foreseen;
+//! [`RollingSweep::from_arrivals`]; more frames of [`arrival_settings`], and of [`check_settings`];
 //! [`RowTimes::fit`], which takes all of these frames. Where it refuses them as a misfit, rows may not be lit evenly:
 //! [`RowTimes::find_spot`] tries how a flying spot would draw them.
 //!
@@ -25,7 +26,7 @@ mod spot;
 mod strip;
 mod table;
 
-pub use coarse::CoarseSweep;
+pub use coarse::{CoarseSweep, RollingSweep};
 pub use columns::Columns;
 pub use error::TimesError;
 pub use result::{Dropped, FrameJitter, Residual, RowTimes};

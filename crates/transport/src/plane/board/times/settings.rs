@@ -3,7 +3,7 @@ use std::ops::Range;
 use ndarray::Array2;
 
 use super::super::super::PlaneError;
-use super::coarse::CoarseSweep;
+use super::coarse::RollingSweep;
 use super::columns::Columns;
 
 /// How the rows of the camera are exposed.
@@ -133,28 +133,29 @@ pub fn sweep_settings(nominal: &Nominal, seen_rows: Range<usize>) -> Result<Vec<
     Ok(opens_before.chain(closes_after).chain(inside).collect())
 }
 
-/// The rolling settings that show when the light of each camera row arrives: exposures of three row times, with delays
-/// in steps of half a row over the range in which `coarse` expects arrivals, 3.5 rows and its error to either side.
+/// The rolling settings that show when the light of each camera row arrives: exposures of three row times, with `delays`
+/// delays over the range in which `rolling` expects arrivals, 3.5 rows and its error to either side.
 ///
-/// Each frame with an edge on the light shows the common offset to within the jitter; take three frames of each
-/// setting, or more if there are fewer than about 40 settings.
+/// A first pass, as [`RollingSweep::foreseen`] has it, finds the range in which light arrives. Each frame with an edge
+/// on the light shows the common offset to within the jitter; take about 130 of them.
 ///
 /// # Errors
 /// Those of [`Nominal::check`].
 pub fn arrival_settings(
     columns: &Columns,
-    coarse: &CoarseSweep,
+    rolling: &RollingSweep,
     nominal: &Nominal,
+    delays: usize,
 ) -> Result<Vec<BoardSetting>, PlaneError> {
     nominal.check()?;
     let row_us = nominal.row_time_us;
     let exposure_us = ARRIVAL_ROWS * row_us;
-    let margin_us = ARRIVAL_MARGIN_ROWS * row_us + coarse.error_us();
-    let (first_us, last_us) = arrivals_range_us(columns, coarse, nominal);
-    let steps = ((last_us - first_us + 2.0 * margin_us) / (row_us / 2.0)).ceil() as usize;
+    let margin_us = ARRIVAL_MARGIN_ROWS * row_us + rolling.error_us();
+    let (first_us, last_us) = arrivals_range_us(columns, rolling);
+    let step_us = (last_us - first_us + 2.0 * margin_us) / (delays.max(2) - 1) as f64;
     let first_us = first_us - exposure_us / 2.0 - margin_us;
-    let delays = (0..=steps).map(|step| first_us + step as f64 * row_us / 2.0);
-    Ok(delays
+    Ok((0..delays)
+        .map(|step| first_us + step as f64 * step_us)
         .map(|delay_us| BoardSetting { shutter: ExposureMode::Rolling, delay_us, exposure_us })
         .collect())
 }
@@ -166,11 +167,11 @@ pub fn arrival_settings(
 /// Those of [`Nominal::check`].
 pub fn check_settings(
     columns: &Columns,
-    coarse: &CoarseSweep,
+    rolling: &RollingSweep,
     nominal: &Nominal,
 ) -> Result<Vec<BoardSetting>, PlaneError> {
     nominal.check()?;
-    let (first_us, last_us) = arrivals_range_us(columns, coarse, nominal);
+    let (first_us, last_us) = arrivals_range_us(columns, rolling);
     let edge_us = |step: usize| first_us + (last_us - first_us) * (step as f64 + 0.5) / CHECK_DELAYS as f64;
     let settings = CHECK_EXPOSURES_US.iter().flat_map(|&exposure_us| {
         (0..CHECK_DELAYS).flat_map(move |step| {
@@ -185,11 +186,11 @@ pub fn check_settings(
 }
 
 /// First and last time at which light arrives, counted from the start of each camera row.
-fn arrivals_range_us(columns: &Columns, coarse: &CoarseSweep, nominal: &Nominal) -> (f64, f64) {
+fn arrivals_range_us(columns: &Columns, rolling: &RollingSweep) -> (f64, f64) {
     let cells = (0..columns.rows()).flat_map(|row| (0..columns.groups()).map(move |group| (row, group)));
     cells
         .map(|(row, group)| (row, columns.cell(row, group)))
         .filter(|(_, cell)| cell.pixels > 0)
-        .map(|(row, cell)| coarse.time_us(cell.place + 0.5) - row as f64 * nominal.camera_row_time_us)
+        .map(|(row, cell)| rolling.time_us(row, cell.place + 0.5))
         .fold((f64::MAX, f64::MIN), |(first, last), time| (first.min(time), last.max(time)))
 }

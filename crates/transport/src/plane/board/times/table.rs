@@ -1,7 +1,7 @@
 use std::ops::Range;
 
 /// Rows from one knot to the next.
-const KNOT_ROWS: usize = 8;
+const KNOT_ROWS: usize = 4;
 /// Rows beyond those seen that the spline covers, because their light reaches them.
 const BORDER_ROWS: usize = 4;
 
