@@ -238,6 +238,8 @@ fn a_camera_that_runs_freely_needs_neither_an_edge_nor_a_watcher() {
         .replace("[sim]\n", "[sim]\nrealtime = true\n");
     for rig in [without_edges, without_watcher] {
         let mut view = View::new(&rig, "trigger = \"none\"\nsubject = \"board\"\n");
+        // On a busy machine, some exposures begin before the light.
+        view.picture(|values| values.pictures > 2 && values.mean_dn > 2500.0);
         // An exposure of a whole period sees all light of each row, wherever it begins: no row is darker than another.
         for _ in 0..15 {
             let values = view.picture(|values| values.pictures > 2);
