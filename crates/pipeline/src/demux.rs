@@ -194,6 +194,7 @@ impl DemuxFold {
         let mut images = Array3::zeros(shape);
         let mut settings = Vec::with_capacity(taken.len());
         let mut dark_frames = Vec::with_capacity(taken.len());
+        let mut delay_sds_us = Vec::with_capacity(taken.len());
         let point_of = |role: &PointRole| self.schedule.points.iter().find(|point| point.role == *role);
         let StripFindings { late_us, .. } = self.jitter();
         let exposures_us = taken.keys().filter_map(point_of).map(|point| point.exposure_us).collect();
@@ -210,11 +211,14 @@ impl DemuxFold {
                 }
                 dark_frames.push(dark.setting.delays_us.len().max(1));
             }
-            settings.push(sample.setting.earlier(late_us.get(&role).copied().unwrap_or(0.0)));
+            let late_us = late_us.get(&role).copied().unwrap_or(self.geometry.unseen_jitter(&sample.setting));
+            settings.push(sample.setting.earlier(late_us.value));
+            delay_sds_us.push(late_us.sd);
         }
         Ok(SweepStack {
             exposures_us,
             dark_frames,
+            delay_sds_us,
             valid,
             ..SweepStack::new(self.timing.clone(), self.options.prior(), settings, images)
         })

@@ -250,13 +250,15 @@ impl FilmSolver {
                 let [image, dark] = [image.view(), dark.view()];
                 strip.late_us(&setting, strip.of_image(&image), strip.of_image(&dark))
             });
-            setting.earlier(late_us.unwrap_or(0.0))
+            let late_us = late_us.unwrap_or(self.geometry.unseen_jitter(&setting));
+            (setting.earlier(late_us.value), late_us.sd)
         };
         let exposures_us = frames.iter().map(|(setting, _)| setting.exposure_us).collect();
-        let settings: Vec<Setting> = frames.iter().map(setting).collect();
+        let (settings, delay_sds_us) = frames.iter().map(setting).unzip();
         SweepStack {
             exposures_us,
             dark_frames: vec![self.dark_frames; frames.len()],
+            delay_sds_us,
             valid,
             ..SweepStack::new(self.demux.timing().clone(), self.demux.prior(), settings, images)
         }

@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2, s};
 use rayon::prelude::*;
-use raysweep_transport::plane::board::CameraCurve;
 use raysweep_transport::plane::board::times::{JitterGauge, Lateness};
+use raysweep_transport::plane::board::{CameraCurve, Estimate};
 use raysweep_transport::plane::{PlaneError, Setting};
 
 use crate::scale::LightScale;
@@ -38,7 +38,7 @@ pub struct StripLight {
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct StripFindings {
     /// By how much the light of each image is late; without those of which the strip shows nothing.
-    pub late_us: BTreeMap<PointRole, f64>,
+    pub late_us: BTreeMap<PointRole, Estimate>,
     /// What was found.
     pub remark: Option<String>,
     /// What is wrong with the strip.
@@ -74,9 +74,14 @@ impl StripGauge {
     }
 
     /// How late the light of an image is; `None` if the strip does not show it, or does not look like the board.
-    pub fn late_us(&self, setting: &Setting, image: ArrayView2<f32>, dark: ArrayView2<f32>) -> Option<f64> {
+    pub fn late_us(
+        &self,
+        setting: &Setting,
+        image: ArrayView2<f32>,
+        dark: ArrayView2<f32>,
+    ) -> Option<Estimate> {
         let found = self.lateness(setting, image, dark)?;
-        self.is_shown(setting, &found).then_some(found.late_us.value)
+        self.is_shown(setting, &found).then_some(found.late_us)
     }
 
     fn is_shown(&self, setting: &Setting, found: &Lateness) -> bool {
@@ -116,10 +121,10 @@ impl StripLight {
             })
             .collect();
         let unlike = found.iter().filter(|(.., found)| found.chi2_per_sample >= MOST_CHI2).count();
-        let late_us: BTreeMap<PointRole, f64> = found
+        let late_us: BTreeMap<PointRole, Estimate> = found
             .iter()
             .filter(|(_, _, shown, _)| *shown)
-            .map(|(role, .., found)| (*role, found.late_us.value))
+            .map(|(role, .., found)| (*role, found.late_us))
             .collect();
         if late_us.is_empty() && unlike == 0 {
             return StripFindings::default();
@@ -132,7 +137,7 @@ impl StripLight {
                 columns.end - 1
             )
         });
-        let rms_us = (late_us.values().map(|late_us| late_us * late_us).sum::<f64>()
+        let rms_us = (late_us.values().map(|late_us| late_us.value * late_us.value).sum::<f64>()
             / late_us.len().max(1) as f64)
             .sqrt();
         let remark = format!(

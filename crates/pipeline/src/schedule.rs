@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use ndarray::{Array2, Axis};
 use raysweep_core::{CameraSettings, Raster, Shutter};
-use raysweep_transport::plane::board::{BoardCalibration, CameraCurve, RowDrawing};
+use raysweep_transport::plane::board::{BoardCalibration, CameraCurve, Estimate, RowDrawing};
 use raysweep_transport::plane::calibrate::{FlyingSpot, Scan};
 use raysweep_transport::plane::{Beam, CameraRows, PlaneError, RowTiming, Setting};
 use serde::Deserialize;
@@ -181,6 +181,13 @@ impl SweepGeometry {
             delays_us: delays_us.iter().map(|delay_us| delay_us + longer_us / 2.0).collect(),
             exposure_us: exposure_us + longer_us,
         }
+    }
+
+    /// How late the light of an image is of which no strip of the board shows it: not known better than the jitter of
+    /// its frames.
+    pub fn unseen_jitter(&self, setting: &Setting) -> Estimate {
+        let jitter_us = self.calibration.as_ref().map_or(0.0, |calibration| calibration.jitter_us);
+        Estimate { value: 0.0, sd: jitter_us / (setting.delays_us.len().max(1) as f64).sqrt() }
     }
 
     /// Counts above black that a white pixel collects in the time of one projector row, `[t, s]` of these camera rows;

@@ -18,6 +18,9 @@ pub struct SweepStack {
     /// Number of frames averaged in the dark image that was subtracted from each image. Images with the same planned
     /// exposure share one.
     pub dark_frames: Vec<usize>,
+    /// Standard deviation of the delay of each image, as far as it is known: what VSYNC stamps do not show of its
+    /// frames' light.
+    pub delay_sds_us: Vec<f64>,
     /// Errors of the calibration that the timing contains; `None` without one.
     pub calibration: Option<CalibrationCovariance>,
     /// `[settings, t, s]` of all camera rows, or those of a [`crate::Strip`]; dark image subtracted, 1 = a white pixel
@@ -42,13 +45,15 @@ pub struct SweepStack {
 }
 
 impl SweepStack {
-    /// Images with these settings, of which nothing else is known: exposures as planned, dark images of one frame.
+    /// Images with these settings, of which nothing else is known: exposures as planned, dark images of one frame,
+    /// exact delays.
     pub(crate) fn new(timing: RowTiming, prior: Prior, settings: Vec<Setting>, images: Array3<f32>) -> Self {
         Self {
             timing,
             prior,
             exposures_us: settings.iter().map(|setting| setting.exposure_us).collect(),
             dark_frames: vec![1; settings.len()],
+            delay_sds_us: vec![0.0; settings.len()],
             settings,
             calibration: None,
             images,
@@ -69,6 +74,7 @@ impl SweepStack {
         Self {
             exposures_us: self.exposures_us.clone(),
             dark_frames: self.dark_frames.clone(),
+            delay_sds_us: self.delay_sds_us.clone(),
             valid: self.valid.as_ref().map(|valid| valid.select(Axis(1), rows)),
             ..Self::new(self.timing.clone(), self.prior, self.settings.clone(), images)
         }
@@ -94,6 +100,7 @@ impl SweepStack {
         }
         self.exposures_us = kept.iter().map(|&n| self.exposures_us[n]).collect();
         self.dark_frames = kept.iter().map(|&n| self.dark_frames[n]).collect();
+        self.delay_sds_us = kept.iter().map(|&n| self.delay_sds_us[n]).collect();
         self.settings = kept.iter().map(|&n| self.settings[n].clone()).collect();
         self.images = self.images.select(Axis(0), &kept);
         self.valid = self.valid.as_ref().map(|valid| valid.select(Axis(0), &kept));

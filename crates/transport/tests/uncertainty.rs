@@ -10,6 +10,9 @@ use std::ops::{Range, RangeInclusive};
 use common::{ELECTRONS_PER_COUNT, READ_NOISE_ELECTRONS, WHITE_COUNTS};
 use common::{corner, ideal_stack, paper_sweep, photographed_in, timing};
 use ndarray::{Array1, Array2, Array3, Axis, concatenate, s};
+use rand_distr::{Distribution, Normal};
+use rand_xoshiro::Xoshiro256PlusPlus;
+use rand_xoshiro::rand_core::SeedableRng;
 use raysweep_transport::plane::{
     Coupling, DarkImage, Demux, LightSums, NoiseModel, PixelResponse, PlaneError, Prior, RESPONSE_ROWS,
     RelitBeam, RowModel, RowTiming, Samples, Setting, SlotKind, Transport, Uncertainty, reach, reference,
@@ -51,6 +54,7 @@ fn spread(rows: Range<usize>, margin: usize, frames: usize, coupling: Option<Cou
         prior: Prior::SPLIT,
         noise,
         frames: &frames,
+        delay_sds_us: &[0.0; 75],
         darks: &[],
         calibration: None,
     };
@@ -140,40 +144,96 @@ fn dark_images_that_images_share_are_part_of_the_uncertainty() {
                     prior: Prior::SPLIT,
                     noise,
                     frames: &frames,
+                    delay_sds_us: &[0.0; 75],
                     darks,
                     calibration: None,
                 };
                 of.of_bands(&estimate, &samples, &bands).unwrap()
             };
-            let lights = bands.each_ref().map(|band| light(&estimate, band).insert_axis(Axis(0)));
-            let lights = concatenate(Axis(0), &lights.each_ref().map(|light| light.view())).unwrap();
-            [lights, sd(&darks), sd(&[])]
+            [lights(&estimate, &bands), sd(&darks), sd(&[])]
         })
         .collect();
-    let mean =
-        measured.iter().fold(Array3::<f32>::zeros(measured[0][0].raw_dim()), |sum, [light, ..]| sum + light)
-            / REPEATS as f32;
-    let nearer = (1.0 - 1.0 / REPEATS as f32).sqrt();
-    let within = |stated: usize| -> [f64; 4] {
-        std::array::from_fn(|band| {
-            let (mut inside, mut all) = (0.0, 0.0);
-            for one in &measured {
-                let deviation = (&one[0] - &mean).index_axis_move(Axis(0), band);
-                for (deviation, sd) in
-                    deviation.iter().zip(one[stated].index_axis(Axis(0), band)).filter(|(_, sd)| **sd > 0.0)
-                {
-                    all += 1.0;
-                    inside += f64::from(u8::from(deviation.abs() < nearer * sd));
-                }
-            }
-            inside / all
-        })
-    };
-    let (with, without) = (within(1), within(2));
+    let (with, without) = (within(&measured, 1), within(&measured, 2));
     println!("with dark images {with:.3?}, without {without:.3?}");
     assert!(with.iter().all(|share| (0.63..0.73).contains(share)), "{with:?}");
     // Without them, the light of all rows together errs more than it should.
     assert!(without[3] < 0.6, "{without:?}");
+}
+
+/// The light of each band, `[bands, t, s]`.
+fn lights(transport: &Transport, bands: &[Vec<RangeInclusive<i32>>; 4]) -> Array3<f32> {
+    let lights = bands.each_ref().map(|band| light(transport, band).insert_axis(Axis(0)));
+    concatenate(Axis(0), &lights.each_ref().map(|light| light.view())).unwrap()
+}
+
+/// For each band, the share of the deviations of repeated measurements, the first of each, from their mean within one
+/// standard deviation, as that with the index `stated` has it.
+fn within(measured: &[[Array3<f32>; 3]], stated: usize) -> [f64; 4] {
+    let repeats = measured.len() as f32;
+    let mean =
+        measured.iter().fold(Array3::<f32>::zeros(measured[0][0].raw_dim()), |sum, [light, ..]| sum + light)
+            / repeats;
+    let nearer = (1.0 - 1.0 / repeats).sqrt();
+    std::array::from_fn(|band| {
+        let (mut inside, mut all) = (0.0, 0.0);
+        for one in measured {
+            let deviation = (&one[0] - &mean).index_axis_move(Axis(0), band);
+            for (deviation, sd) in
+                deviation.iter().zip(one[stated].index_axis(Axis(0), band)).filter(|(_, sd)| **sd > 0.0)
+            {
+                all += 1.0;
+                inside += f64::from(u8::from(deviation.abs() < nearer * sd));
+            }
+        }
+        inside / all
+    })
+}
+
+/// Repeated measurements in which each image is early or late by 1.5 us, a third of a frame's jitter: for each band,
+/// the share of the deviations within one standard deviation, as stated with and without the errors of delays.
+#[test]
+fn jitter_that_no_stamp_shows_is_part_of_the_uncertainty() {
+    const REPEATS: u64 = 40;
+    const SD_US: f64 = 1.5;
+    let rows = 62..64;
+    let timing = timing().window(rows.start, rows.len()).unwrap();
+    // Edges over direct light, as in edges.toml.
+    let mut settings = paper_sweep();
+    settings.truncate(60);
+    settings.extend((0..15).map(|n| Setting::new(222.23 + 11.11 * f64::from(n), 600.0)));
+    let demux = Demux::new(timing.clone(), settings.clone(), Prior::SPLIT).unwrap();
+    let bands =
+        [vec![0..=0], vec![-10..=-1, 1..=10], vec![i32::MIN..=-11, 11..=i32::MAX], vec![i32::MIN..=i32::MAX]];
+    let measured: Vec<[Array3<f32>; 3]> = (0..REPEATS)
+        .map(|seed| {
+            let mut random = Xoshiro256PlusPlus::seed_from_u64(500 + seed);
+            let jitter = Normal::new(0.0, SD_US).unwrap();
+            let taken: Vec<Setting> =
+                settings.iter().map(|setting| setting.earlier(jitter.sample(&mut random))).collect();
+            let ideal = ideal_stack(&corner(), &taken).slice(s![.., rows.clone(), ..;8]).to_owned();
+            let stack = photographed_in(8, &ideal, seed);
+            let estimate = demux.solve(stack.view(), None).unwrap();
+            let samples = Samples { stack: stack.view(), valid: None, variance_ratio: None, u0_rows: None };
+            let sd = |delay_sd_us: f64| {
+                let of = Uncertainty {
+                    timing: &timing,
+                    settings: &settings,
+                    prior: Prior::SPLIT,
+                    noise: camera_noise(),
+                    frames: &[8; 75],
+                    delay_sds_us: &[delay_sd_us; 75],
+                    darks: &[],
+                    calibration: None,
+                };
+                of.of_bands(&estimate, &samples, &bands).unwrap()
+            };
+            [lights(&estimate, &bands), sd(SD_US), sd(0.0)]
+        })
+        .collect();
+    let (with, without) = (within(&measured, 1), within(&measured, 2));
+    println!("with jitter {with:.3?}, without {without:.3?}");
+    assert!(with.iter().all(|share| (0.6..0.76).contains(share)), "{with:?}");
+    assert!(without[0] < 0.6, "{without:?}");
 }
 
 /// A profile of 31 rows around `u = 0`: a direct spike over a hill of indirect light that is cut off at 0.
@@ -256,6 +316,7 @@ fn equals_the_change_of_the_estimate_with_each_sample() {
                 prior,
                 noise,
                 frames: &frames,
+                delay_sds_us: &[0.0; 24],
                 darks: &[],
                 calibration: None,
             };
@@ -291,6 +352,7 @@ fn dark_pixels_are_certain_and_misfits_are_refused() {
             prior: Prior::SPLIT,
             noise,
             frames,
+            delay_sds_us: &[0.0; 75],
             darks: &[],
             calibration: None,
         };
@@ -350,6 +412,7 @@ fn direct_light_between_rows_is_judged_where_it_lies() {
             prior: Prior::SPLIT,
             noise: camera_noise(),
             frames: &frames,
+            delay_sds_us: &[0.0; 24],
             darks: &[],
             calibration: None,
         };
@@ -394,6 +457,7 @@ fn relit_images_spread_as_predicted() {
         prior: Prior::SPLIT,
         noise: camera_noise(),
         frames: &frames,
+        delay_sds_us: &[0.0; 75],
         darks: &[],
         calibration: None,
     };

@@ -4,6 +4,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
+mod coverage;
+
 use std::path::{Path, PathBuf};
 
 use ndarray::{Array2, Array3, ArrayView3, Axis, s};
@@ -20,7 +22,7 @@ const ROW_TIME_US: f64 = 22.22;
 const STATED_LATENCY_US: f64 = 8.0;
 const SWEEP: &str = "kind = \"sweep\"\n[sweep]\ndelay_us = { start = -1500, stop = 1500, count = 15 }\n\
                      exposure_us = { start = 600, stop = 1200, count = 5 }\naverage = 8\n";
-const EDGES: &str = include_str!("../../deploy/plans/edges.toml");
+const EDGES: &str = include_str!("../../../deploy/plans/edges.toml");
 const FILM: &str = "kind = \"film\"\n[film]\ncycles = 8\nexposure_us = 600\ndelay_us = [-1500, -1000, -640, -420, \
                     -333, -311, -289, 0, 289, 311, 333, 420, 640, 1000, 1500]\n";
 

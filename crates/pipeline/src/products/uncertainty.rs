@@ -56,7 +56,7 @@ impl LightOf {
             model.of_sums_in_rows(first_row, transport, samples, sums)
         })?;
         let of = match stack.calibration {
-            Some(_) => "noise, dark images and calibration",
+            Some(_) => "noise, dark images, jitter and calibration",
             None => "noise and dark images",
         };
         let about = format!(
@@ -127,6 +127,7 @@ fn image(
         // The stack from which the noise was fitted contains that of the dark images.
         noise: noise.without_darks(ratios.sum::<f64>() / frames.len() as f64),
         frames: &frames,
+        delay_sds_us: &stack.delay_sds_us,
         darks: &stack.darks(),
         calibration: stack.calibration.as_ref(),
     };

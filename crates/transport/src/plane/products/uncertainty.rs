@@ -4,7 +4,7 @@ use ndarray::{
     Array1, Array2, Array3, ArrayView1, ArrayView2, ArrayView3, ArrayViewMut1, ArrayViewMut2, Axis,
 };
 
-use super::super::board::CalibrationCovariance;
+use super::super::board::{CalibrationCovariance, CalibrationParameter};
 use super::super::error::check_shape;
 use super::super::noise::check_shapes;
 use super::super::solve::pivot::minimise_free;
@@ -22,7 +22,8 @@ use super::sensitivity::changes;
 ///
 /// `S` also contains the noise of the dark images: all images of one exposure share that of theirs, so that it adds up
 /// over them in long bands. Errors of a calibration change the light that the model predicts by `J = dA/dq T` for each
-/// parameter `q`, and add `J C J'` with the covariance `C` of the parameters.
+/// parameter `q`, and add `J C J'` with the covariance `C` of the parameters. An error of an image's delay changes all
+/// its samples together, in the same way.
 ///
 /// It is the spread of repeated measurements, each with a calibration of its own if that is given, around their mean.
 /// It does not include the bias of the prior, which smooths what the settings cannot resolve (see
@@ -39,6 +40,8 @@ pub struct Uncertainty<'a> {
     pub noise: NoiseModel,
     /// Number of frames averaged in each setting's image.
     pub frames: &'a [usize],
+    /// Standard deviation of the delay of each setting's image, in microseconds, independent of each other.
+    pub delay_sds_us: &'a [f64],
     /// The dark images that were subtracted; a setting has at most one.
     pub darks: &'a [DarkImage],
     /// Errors of the calibration that the timing contains; `None` for those of noise alone.
@@ -202,7 +205,7 @@ impl Uncertainty<'_> {
         Ok(out)
     }
 
-    /// Variance of each sum of each pixel of a tile in camera row `t` through errors of the calibration,
+    /// Variance of each sum of each pixel of a tile in camera row `t` through errors of the calibration and of delays,
     /// `[pixels * sums]`.
     fn systematic(
         &self,
@@ -212,14 +215,22 @@ impl Uncertainty<'_> {
         light: &Array2<f64>,
         gains: &Array2<f64>,
     ) -> Array1<f64> {
-        let Some(covariance) = self.calibration else { return Array1::zeros(gains.nrows()) };
+        let delay_sds_us: Array1<f64> = problem.settings.iter().map(|&n| self.delay_sds_us[n]).collect();
+        if self.calibration.is_none() && delay_sds_us.iter().all(|&sd_us| sd_us == 0.0) {
+            return Array1::zeros(gains.nrows());
+        }
         let columns: Vec<usize> = tile.pixels.iter().map(|&(_, column)| column).collect();
         let settings: Vec<Setting> = problem.settings.iter().map(|&n| self.settings[n].clone()).collect();
         let changes = changes(self.timing, &settings, problem, (t, &columns), light);
         let bands = gains.nrows() / tile.pixels.len();
+        let by_time = &changes[CalibrationParameter::Latency as usize];
         Array1::from_shape_fn(gains.nrows(), |row| {
-            covariance
-                .variance_of(&changes.each_ref().map(|change| gains.row(row).dot(&change.row(row / bands))))
+            let (gains, pixel) = (gains.row(row), row / bands);
+            let of_delays = (&gains * &by_time.row(pixel) * &delay_sds_us).mapv(|light| light * light).sum();
+            let of_calibration = self.calibration.map_or(0.0, |covariance| {
+                covariance.variance_of(&changes.each_ref().map(|change| gains.dot(&change.row(pixel))))
+            });
+            of_delays + of_calibration
         })
     }
 
@@ -228,6 +239,7 @@ impl Uncertainty<'_> {
         self.prior.check()?;
         self.noise.check()?;
         check_shapes(samples.stack, samples.valid, self.frames)?;
+        check_shape("delay_sds_us", "[settings]", &[self.delay_sds_us.len()], &[self.settings.len()])?;
         let (_, rows, columns) = transport.t.dim();
         let (end, camera_rows) = (first_row + rows, self.timing.camera_rows());
         if end > camera_rows {
