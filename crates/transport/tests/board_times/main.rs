@@ -7,13 +7,14 @@ mod rig;
 use std::time::Instant;
 
 use ndarray::Array2;
+use raysweep_transport::plane::RowTiming;
 use raysweep_transport::plane::board::Estimate;
 use raysweep_transport::plane::board::times::{
     BoardFrame, BoardSetting, CoarseSweep, Columns, ExposureMode, RollingSweep, RowTimes, TimesError,
     arrival_settings, check_settings, sweep_settings,
 };
 use raysweep_transport::plane::calibrate::{FlyingSpot, Scan};
-use rig::{Case, Jitter, Rig};
+use rig::{Case, Jitter, PROJECTOR_ROWS, Rig};
 
 /// Delays of a pass over the arrivals of light.
 const DELAYS: usize = 64;
@@ -221,6 +222,19 @@ fn rows_outside_the_window_are_uncertain() {
         assert!(wrong(v) < 3.0 * times.row_starts_sd_us[v] + 40.0, "row {v}: {}", wrong(v));
     }
     assert!(times.row_starts_sd_us[0] > 100.0 && times.row_starts_sd_us[360] < 1.0);
+}
+
+/// Where the sweep is slowest, a table that goes on as it does there leaves the period, which no model takes.
+#[test]
+fn all_rows_fit_into_a_period_wherever_the_window_is() {
+    for first in [8, 584] {
+        let session = Session::taken(Case { window: (first, 128), ..Case::window(41) });
+        let starts_us = session.fit().unwrap().row_starts_us;
+        let timing = RowTiming::new(PROJECTOR_ROWS, 22.22, session.rig.nominal().period_us).unwrap();
+        let lit_us = starts_us[PROJECTOR_ROWS] - starts_us[0];
+        println!("window from row {first}: all rows take {lit_us:.0} us");
+        assert!(timing.with_row_table(&starts_us).is_ok(), "{lit_us}");
+    }
 }
 
 #[test]

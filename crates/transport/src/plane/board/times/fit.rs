@@ -185,8 +185,12 @@ impl<'a> Fit<'a> {
         &self.unknowns[..self.table.coefficients]
     }
 
+    fn starts_us(&self) -> Vec<f64> {
+        self.table.starts_us(self.coefficients(), self.nominal.period_us)
+    }
+
     fn sweep(&self) -> Sweep {
-        Sweep::new(self.table.starts_us(self.coefficients()), self.nominal.period_us)
+        Sweep::new(self.starts_us(), self.nominal.period_us)
     }
 
     fn comparison<'b>(&'b self, sweep: &'b Sweep) -> FrameComparison<'b> {
@@ -437,7 +441,7 @@ impl<'a> Fit<'a> {
     }
 
     fn check_order(&self) -> Result<(), TimesError> {
-        let starts_us = self.table.starts_us(self.coefficients());
+        let starts_us = self.starts_us();
         let back = |row: &usize| starts_us[row + 1] <= starts_us[*row];
         match self.columns.seen_rows().find(back) {
             Some(row) => Err(TimesError::FoldsBack { row, back_us: starts_us[row] - starts_us[row + 1] }),
@@ -589,7 +593,7 @@ impl<'a> Fit<'a> {
             })
         };
         Ok(RowTimes {
-            row_starts_us: self.table.starts_us(self.coefficients()),
+            row_starts_us: self.starts_us(),
             row_starts_sd_us,
             row_starts_modes,
             row_time_us: measured(&row_time),

@@ -1,15 +1,20 @@
-use std::ops::Range;
+use std::ops::{Range, RangeInclusive};
 
 /// Rows from one knot to the next.
 const KNOT_ROWS: usize = 4;
+/// Share of the rest of a period in which rows that are not seen may be drawn.
+const PERIOD_USED: f64 = 0.999;
 /// Rows beyond those seen that the spline covers, because their light reaches them.
 const BORDER_ROWS: usize = 4;
 
-/// The table of row starts as a cubic B-spline over the rows seen, continued with its outermost slopes.
+/// The table of row starts as a cubic B-spline over the rows seen and [`BORDER_ROWS`] more. Weights of rows beyond continue
+/// it with its outermost slopes, which tells how uncertain they are.
 #[derive(Debug, Clone)]
 pub(super) struct SplineTable {
     /// Number of coefficients.
     pub coefficients: usize,
+    /// The row starts that the spline covers.
+    covered: RangeInclusive<usize>,
     /// For each row start, the first of four coefficients and their weights.
     weights: Vec<(usize, [f64; 4])>,
 }
@@ -27,7 +32,7 @@ impl SplineTable {
             let (value, slope) = (basis(x), basis_slope(x));
             (interval, std::array::from_fn(|index| value[index] + rest * slope[index]))
         });
-        Self { coefficients: intervals + 3, weights: weights.collect() }
+        Self { coefficients: intervals + 3, covered: first..=end, weights: weights.collect() }
     }
 
     /// The first of the four coefficients on which a row's start depends, and their weights.
@@ -37,12 +42,24 @@ impl SplineTable {
         (*first, weights)
     }
 
-    /// Start of each row, and end of the last.
-    pub fn starts_us(&self, coefficients: &[f64]) -> Vec<f64> {
-        let start = |(first, weights): &(usize, [f64; 4])| {
-            weights.iter().zip(&coefficients[*first..]).map(|(weight, value)| weight * value).sum()
+    /// Start of each row, and end of the last. Beyond the spline, the sweep goes on as it does over it, faster if the rows
+    /// would not fit into a period: an outermost slope would carry the noise of a few rows, or a kink, over hundreds.
+    pub fn starts_us(&self, coefficients: &[f64], period_us: f64) -> Vec<f64> {
+        let start = |row: usize| -> f64 {
+            let (first, weights) = self.weights(row);
+            weights.iter().zip(&coefficients[first..]).map(|(weight, value)| weight * value).sum()
         };
-        self.weights.iter().map(start).collect()
+        let (first, end) = (*self.covered.start(), *self.covered.end());
+        let (from_us, to_us) = (start(first), start(end));
+        let unseen = self.weights.len() - 1 - (end - first);
+        let free_us = (period_us - (to_us - from_us)) * PERIOD_USED;
+        let row_us = ((to_us - from_us) / (end - first) as f64).min(free_us / unseen.max(1) as f64);
+        let continued = |row: usize| match row {
+            row if row < first => from_us - (first - row) as f64 * row_us,
+            row if row > end => to_us + (row - end) as f64 * row_us,
+            row => start(row),
+        };
+        (0..self.weights.len()).map(continued).collect()
     }
 
     /// Weights of all coefficients in the start of a row, or of a fraction of it.
@@ -85,7 +102,7 @@ mod tests {
         // Coefficient k belongs to row 292 + KNOT_ROWS (k - 1).
         let coefficients: Vec<f64> =
             (0..table.coefficients).map(|k| 22.22 * (292.0 + KNOT_ROWS as f64 * (k as f64 - 1.0))).collect();
-        for (row, start_us) in table.starts_us(&coefficients).iter().enumerate() {
+        for (row, start_us) in table.starts_us(&coefficients, 16_667.0).iter().enumerate() {
             assert!((start_us - 22.22 * row as f64).abs() < 1e-9, "row {row}: {start_us}");
         }
     }
