@@ -109,7 +109,7 @@ fn true_light(sim: &PlaneRig, [from, to]: [i32; 2]) -> Array2<f32> {
     let scene = sim.scene().transport.index_axis(Axis(3), 0).to_owned();
     let rows: Array3<f32> = relative_rows(scene.view(), &(-to..=to));
     let far = rows.axis_iter(Axis(0)).zip(-to..=to).filter(|(_, u)| u.abs() >= from);
-    far.fold(Array2::zeros((rows.len_of(Axis(1)), rows.len_of(Axis(2)))), |sum, (row, _)| sum + &row)
+    far.fold(Array2::zeros((rows.len_of(Axis(1)), rows.len_of(Axis(2)))), |sum, (row, _)| sum + row)
 }
 
 /// `RUNS` pairs of a calibration and a run (50), of `PLAN` `sweep` or `edges`: prints shares within one standard
