@@ -3,7 +3,7 @@
 
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use raysweep_core::{DeviceErrorKind, Mirror};
 use raysweep_drivers::mirror::{Mti, Parked, PlayzerX, park};
@@ -13,8 +13,9 @@ use raysweep_sim::mirror::{
 };
 use tempfile::tempdir;
 
+use crate::HUNG;
 use crate::points::{circle, mti_config};
-use crate::rig::{LIMITS, Rig, batch, largest_step};
+use crate::rig::{LIMITS, Rig, batch, error_of, largest_step};
 use crate::scripts::{Script, line};
 
 /// A restart, as documented by the maker: `pl`, `b`, length, magic number, end.
@@ -70,7 +71,9 @@ fn playing(rig: &Rig) -> PlayzerX {
     let mut mirror = rig.open();
     mirror.load(&batch()).unwrap();
     mirror.start(1000).unwrap();
+    let began = Instant::now();
     while rig.pty.look(|truth| truth.held.iter().filter(|held| held.light > 0).count()) < 10_000 {
+        assert!(began.elapsed() < HUNG, "no light");
         mirror.feed().unwrap();
         std::thread::sleep(Duration::from_millis(2));
     }
@@ -90,15 +93,6 @@ fn assert_no_step(rig: &Rig, mishap: &Mishap) -> usize {
         "{resets} resets, but steps of more than {allowed} codes: {steps:?}"
     );
     resets
-}
-
-fn error_of(mirror: &mut PlayzerX) -> raysweep_core::DeviceError {
-    loop {
-        if let Err(error) = mirror.feed() {
-            return error;
-        }
-        std::thread::sleep(Duration::from_millis(2));
-    }
 }
 
 #[test]
@@ -163,11 +157,7 @@ fn the_high_voltage_of_an_mti_that_cannot_be_parked_goes_off() {
         Mti::open(mti_config(script.pty.path().to_owned(), script.state(), script.light())).unwrap();
     mirror.load(&circle(60).with_light(|_| 0)).unwrap();
     mirror.start(10).unwrap();
-    let error = loop {
-        if let Err(error) = mirror.feed() {
-            break error;
-        }
-    };
+    let error = error_of(&mut mirror);
     assert_eq!(error.kind, DeviceErrorKind::Protocol, "{error}");
     drop(mirror);
     let lines = script.lines();

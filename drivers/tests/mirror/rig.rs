@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use raysweep_core::{Mirror, MirrorLimits, MirrorPath, MirrorProgress, Tilt};
+use raysweep_core::{DeviceError, Mirror, MirrorLimits, MirrorPath, MirrorProgress, Tilt};
 use raysweep_drivers::mirror::playzerx::protocol::MirrorSample;
 use raysweep_drivers::mirror::{self, LightGuard, PlayzerX, arm_light};
 use raysweep_sim::mirror::{
@@ -158,6 +158,18 @@ pub fn play(mirror: &mut dyn Mirror) -> MirrorProgress {
         if progress.parked {
             return progress;
         }
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+/// Feeds a mirror until it refuses.
+pub fn error_of(mirror: &mut dyn Mirror) -> DeviceError {
+    let began = Instant::now();
+    loop {
+        if let Err(error) = mirror.feed() {
+            return error;
+        }
+        assert!(began.elapsed() < HUNG, "no error");
         std::thread::sleep(Duration::from_millis(2));
     }
 }

@@ -5,7 +5,7 @@ use std::os::unix::process::ExitStatusExt;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
@@ -16,8 +16,9 @@ use raysweep_drivers::mirror::{
 };
 use raysweep_sim::mirror::{Held, PlayzerXControllerConfig, WireFaults};
 
+use crate::HUNG;
 use crate::points::{circle, mti_config, mti_rig};
-use crate::rig::{LIMITS, Rig, batch, codes, largest_step};
+use crate::rig::{LIMITS, Rig, batch, codes, error_of, largest_step};
 
 /// A mirror in the middle of a path.
 fn playing(rig: &Rig) -> PlayzerX {
@@ -88,7 +89,9 @@ fn sigkill_while_the_state_is_being_written() {
             let sent = std::fs::read_to_string(format!("{}.sent", rig.state().display())).unwrap();
             sent.starts_with(&u64::MAX.to_string())
         };
+        let began = Instant::now();
         while when == "park" && !is_told() {
+            assert!(began.elapsed() < HUNG, "not told");
             std::thread::sleep(Duration::from_millis(5));
         }
         kill(Pid::from_raw(child.id() as i32), Signal::SIGKILL).unwrap();
@@ -191,12 +194,7 @@ fn unplug_and_plug_in_again() {
     let since_ns = now_ns();
     // The controller loses its power with the plug: the light is off and the mirror springs back.
     rig.pty.unplug();
-    let error = loop {
-        if let Err(error) = mirror.feed() {
-            break error;
-        }
-        std::thread::sleep(Duration::from_millis(2));
-    };
+    let error = error_of(&mut mirror);
     assert_eq!(error.kind, DeviceErrorKind::Disconnected, "{error}");
     println!("unplug: noticed after {:.1} ms", (now_ns() - since_ns) as f64 / 1e6);
     drop(mirror);
@@ -223,7 +221,7 @@ fn a_controller_that_was_plugged_in_again_is_not_taken_for_the_one_that_was_left
     let again =
         Rig::playzerx(PlayzerXControllerConfig { reset_s: 0.1, ..Default::default() }, WireFaults::default());
     rig.pty.unplug();
-    while mirror.feed().is_ok() {}
+    error_of(&mut mirror);
     drop(mirror);
     std::fs::remove_file(&name).unwrap();
     std::os::unix::fs::symlink(again.pty.path(), &name).unwrap();

@@ -6,6 +6,7 @@ use std::path::Path;
 
 use ndarray::{Array2, Array3, Axis};
 use ndarray_npy::read_npy;
+use raysweep_config::sim::SimSensor;
 use raysweep_processing::calibration::KeptCalibration;
 use raysweep_sim::PlaneRig;
 use raysweep_transport::plane::relative_rows;
@@ -45,6 +46,7 @@ const PARAMETERS: [&str; 6] =
 
 fn errors_of(found: &KeptCalibration, sim: &PlaneRig) -> Errors {
     let (timing, light, truth) = (&found.header.timing, &found.header.light, sim.truth());
+    let sensor = SimSensor::default();
     let starts_us = sim.row_starts_us().unwrap();
     let [first, end] = timing.seen_rows;
     let late_us = truth.trigger_latency_us - STATED_LATENCY_US;
@@ -85,8 +87,8 @@ fn errors_of(found: &KeptCalibration, sim: &PlaneRig) -> Errors {
             of(timing.camera_row_time_us, truth.camera_row_time_us),
             of(timing.exposure_offset_us, 0.0),
             latency_us / timing.latency_sd_us,
-            of(light.electrons_per_dn, 1.66),
-            of(light.read_noise_e, 9.0),
+            of(light.electrons_per_dn, sensor.electrons_per_dn),
+            of(light.read_noise_e, sensor.read_noise_e),
         ],
         within: [share(rest), share(lit.iter().map(|(off, sd)| (off - offset) / sd))],
     }

@@ -1,3 +1,5 @@
+mod covariance;
+
 use nalgebra::{DMatrix, DVector};
 
 use super::super::super::NoiseModel;
@@ -33,8 +35,6 @@ const MISFIT: f64 = 9.0;
 const NO_EDGE_SD_US: f64 = 2.0;
 /// Smallest jitter; smaller ones cannot be told from the noise.
 const LEAST_JITTER_US: f64 = 0.05;
-/// Camera rows whose responses have errors in common, because they are averaged over as many.
-const BLOCK_ROWS: usize = 21;
 /// Limits of what is accepted.
 const MAX_CHI2_PER_SAMPLE: f64 = 3.0;
 const MAX_EXPOSURE_DIFFERENCE_US: f64 = 0.3;
@@ -44,10 +44,6 @@ const DIFFERENCE_SDS: f64 = 5.0;
 /// What single exposures may differ from the others, while it is fixed and while it is fitted.
 const FIXED_US: f64 = 1e-4;
 const FREE_US: f64 = 20.0;
-/// Share of the variance beside offset and slope that the modes may leave unexplained.
-const MODES_REST: f64 = 0.01;
-/// How much more a sweep may bend beyond the rows seen: the time by which it is early in its middle, as a share of it.
-const BEND: f64 = 0.02;
 
 impl RowTimes {
     /// Fits the times of rows to single frames of the board. `noise` is that of a single pixel, in shares of white.
@@ -474,78 +470,6 @@ impl<'a> Fit<'a> {
         Ok(())
     }
 
-    /// Covariance of the unknowns. `free` frees the differences between exposures.
-    ///
-    /// Residuals are not independent: the brightness of a drawn row is wrong in all columns and all frames, and the
-    /// response of a few columns over many rows. The inverse of the normal matrix alone would be several times too
-    /// small. So the scatter of the scores is summed over camera rows, and over blocks of rows in a group of columns,
-    /// and what both contain is subtracted (clustered in two ways). Jitters and priors are independent and enter as
-    /// they are. A camera row draws the table towards its own error, the more the nearer it is to an end, so its scores
-    /// are those at the unknowns that the other rows give (the jackknife: CR3 of Bell and McCaffrey 2002).
-    fn covariance(&self, free: bool) -> Result<DMatrix<f64>, TimesError> {
-        let Normal { matrix, frames, .. } = self.normal(free);
-        let count = self.unknowns.len();
-        let (rows, groups) = (self.columns.rows(), self.columns.groups());
-        let sweep = self.sweep();
-        let comparison = self.comparison(&sweep);
-        let mut cells = DMatrix::zeros(count, rows * groups);
-        let mut by_jitter = DMatrix::zeros(frames.len(), rows * groups);
-        let mut jitters = DMatrix::zeros(count, frames.len());
-        let mut information: Vec<Vec<DVector<f64>>> = vec![Vec::new(); rows];
-        for (index, own) in frames.iter().enumerate() {
-            let frame = &self.frames[own.frame];
-            let late = (self.late_us[own.frame], self.longer_us(own.frame));
-            jitters.set_column(index, &(&own.mixed / own.weight));
-            comparison.visit(frame, late, BoardSamples::OnEdges, |row, opening, closing, sums| {
-                let edges = self.edges(own.frame, row, opening, closing);
-                information[row].extend(own.information(&edges, sums));
-                for group in 0..groups {
-                    let cell = row * groups + group;
-                    let sums = comparison.compare(frame, row, group..group + 1, (opening, closing), false);
-                    let residuals = [-sums.opening_residual, sums.closing_residual];
-                    for (edge, residual) in edges.iter().zip(residuals) {
-                        edge.entries().iter().for_each(|&(a, x)| cells[(a, cell)] += residual * x);
-                        by_jitter[(index, cell)] -= residual;
-                    }
-                }
-            });
-        }
-        cells -= &jitters * by_jitter;
-        let summed = |clusters: usize, cluster: &dyn Fn(usize, usize) -> usize| {
-            let mut sums = DMatrix::zeros(count, clusters);
-            for (row, group) in (0..rows).flat_map(|row| (0..groups).map(move |group| (row, group))) {
-                let mut sum = sums.column_mut(cluster(row, group));
-                sum += cells.column(row * groups + group);
-            }
-            &sums * sums.transpose()
-        };
-        let blocks = rows.div_ceil(BLOCK_ROWS);
-        let by_block = summed(blocks * groups, &|row, group| row / BLOCK_ROWS * groups + group);
-        let mut scatter = by_block - &cells * cells.transpose();
-        scatter += &jitters * jitters.transpose() * self.jitter_prior_us.powi(-2);
-        let mut right = DVector::zeros(count);
-        self.add_priors(&mut scatter, &mut right, free);
-        let inverse = matrix.cholesky().ok_or(TimesError::Undetermined)?.inverse();
-        let mut covariance = &inverse * scatter * &inverse;
-        for (row, information) in information.iter().enumerate().filter(|(_, of_row)| !of_row.is_empty()) {
-            let score = cells.columns(row * groups, groups).column_sum();
-            let mut change = &inverse * &score;
-            // (A - U U')^-1 s by the formula of Woodbury.
-            let own = DMatrix::from_columns(information);
-            let spread = &inverse * &own;
-            let others = DMatrix::identity(own.ncols(), own.ncols()) - own.tr_mul(&spread);
-            if let Some(others) = others.cholesky() {
-                change += &spread * others.solve(&spread.tr_mul(&score));
-            }
-            covariance.ger(1.0, &change, &change, 1.0);
-        }
-        // A difference of sums of squares may be slightly negative.
-        let mut eigen = ((&covariance + covariance.transpose()) / 2.0).symmetric_eigen();
-        let least = eigen.eigenvalues.amax() * 1e-12;
-        eigen.eigenvalues.apply(|value| *value = value.max(least));
-        Ok(eigen.recompose())
-    }
-
     fn result(&self, jitter_us: Estimate, residuals: Vec<Residual>) -> Result<RowTimes, TimesError> {
         let covariance = self.covariance(false)?;
         let coefficients = self.table.coefficients;
@@ -615,79 +539,9 @@ impl<'a> Fit<'a> {
             seen_rows,
         })
     }
-
-    /// Modes of the covariance of the row starts, `[mode, row]`, and the standard deviations of the row starts.
-    fn modes(&self, covariance: &DMatrix<f64>) -> Result<(ndarray::Array2<f64>, Vec<f64>), TimesError> {
-        let rows = self.nominal.projector_rows + 1;
-        let count = self.table.coefficients;
-        let root = covariance.view((0, 0), (count, count)).clone_owned();
-        let root = root.cholesky().ok_or(TimesError::Undetermined)?.l();
-        let mut factor = DMatrix::zeros(rows, count);
-        for row in 0..rows {
-            let (first, weights) = self.table.weights(row);
-            for (index, weight) in weights.iter().enumerate() {
-                for column in 0..=first + index {
-                    factor[(row, column)] += weight * root[(first + index, column)];
-                }
-            }
-        }
-        // The covariance is factor * factor'. What its mean and its slope over the rows seen explain, is split off.
-        let seen = self.columns.seen_rows();
-        let length = seen.len() as f64 + 1.0;
-        let offset = DVector::from_fn(rows, |row, _| f64::from(row >= seen.start && row <= seen.end));
-        let middle = (seen.start + seen.end) as f64 / 2.0;
-        let slope = DVector::from_fn(rows, |row, _| offset[row] * (row as f64 - middle) / length);
-        let mut modes: Vec<DVector<f64>> = Vec::new();
-        let whole = factor.clone();
-        for direction in [offset, slope] {
-            let along = factor.tr_mul(&direction);
-            let along = &along / along.norm().max(f64::MIN_POSITIVE);
-            let mode = &factor * &along;
-            factor.ger(-1.0, &mode, &along, 1.0);
-            modes.push(mode);
-        }
-        // Beyond the rows seen, the sweep may bend: early by a share of the sweep in its middle is this curvature.
-        let curvature_us = 8.0 * BEND * self.nominal.row_time_us / self.nominal.projector_rows as f64;
-        let bend = |away: usize| curvature_us * (away as f64).powi(2) / 2.0;
-        modes.push(DVector::from_fn(rows, |row, _| bend(seen.start.saturating_sub(row))));
-        modes.push(DVector::from_fn(rows, |row, _| bend(row.saturating_sub(seen.end))));
-        let variance =
-            |row: usize| whole.row(row).norm_squared() + modes[2][row].powi(2) + modes[3][row].powi(2);
-        let sd_us = (0..rows).map(|row| variance(row).sqrt()).collect();
-        // Beyond the rows seen, the largest modes would be those of the extrapolation, which the bend covers.
-        let inside = factor.rows(seen.start, seen.len() + 1).clone_owned();
-        let eigen = inside.tr_mul(&inside).symmetric_eigen();
-        let mut order: Vec<usize> = (0..count).collect();
-        order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]));
-        let mut rest: f64 = eigen.eigenvalues.iter().sum();
-        let enough = MODES_REST * rest;
-        for index in order {
-            if rest <= enough {
-                break;
-            }
-            rest -= eigen.eigenvalues[index];
-            modes.push(&factor * eigen.eigenvectors.column(index));
-        }
-        let modes = ndarray::Array2::from_shape_fn((modes.len(), rows), |(mode, row)| modes[mode][row]);
-        Ok((modes, sd_us))
-    }
 }
 
 impl FrameNormal {
-    /// What the samples of one camera row tell of the unknowns, after the frame's jitter: the sum of the outer products of
-    /// these vectors.
-    fn information(&self, edges: &[Sparse; 2], sums: &Sums) -> [DVector<f64>; 2] {
-        let [opening, closing] = edges.each_ref().map(|edge| {
-            let mut derivative = &self.mixed / self.weight;
-            edge.entries().iter().for_each(|&(a, x)| derivative[a] += x);
-            derivative
-        });
-        let both = sums.opening_square.max(f64::MIN_POSITIVE).sqrt();
-        let of_closing = -sums.mixed / both;
-        let rest = (sums.closing_square - of_closing * of_closing).max(0.0).sqrt();
-        [opening * both + &closing * of_closing, closing * rest]
-    }
-
     /// Adds the samples of one camera row. The light is `closing` minus `opening`, and late light is an early edge.
     fn add(
         &mut self,

@@ -1,0 +1,167 @@
+//! What the fit states of its errors.
+
+use nalgebra::{DMatrix, DVector};
+
+use super::super::error::TimesError;
+use super::super::model::{BoardSamples, Sums};
+use super::{Fit, FrameNormal, Normal, Sparse};
+
+/// Camera rows whose responses have errors in common, because they are averaged over as many.
+const BLOCK_ROWS: usize = 21;
+/// Share of the variance beside offset and slope that the modes may leave unexplained.
+const MODES_REST: f64 = 0.01;
+/// How much more a sweep may bend beyond the rows seen: the time by which it is early in its middle, as a share of it.
+const BEND: f64 = 0.02;
+
+/// What a camera row shows of the unknowns in one frame.
+struct RowSample {
+    /// Index among the frames used.
+    frame: usize,
+    edges: [Sparse; 2],
+    sums: Sums,
+}
+
+impl Fit<'_> {
+    /// Covariance of the unknowns. `free` frees the differences between exposures.
+    ///
+    /// Residuals are not independent: the brightness of a drawn row is wrong in all columns and all frames, and the
+    /// response of a few columns over many rows. The inverse of the normal matrix alone would be several times too
+    /// small. So the scatter of the scores is summed over camera rows, and over blocks of rows in a group of columns,
+    /// and what both contain is subtracted (clustered in two ways). Jitters and priors are independent and enter as
+    /// they are. A camera row draws the table towards its own error, the more the nearer it is to an end, so its scores
+    /// are those at the unknowns that the other rows give (the jackknife: CR3 of Bell and McCaffrey 2002).
+    pub(super) fn covariance(&self, free: bool) -> Result<DMatrix<f64>, TimesError> {
+        let Normal { matrix, frames, .. } = self.normal(free);
+        let count = self.unknowns.len();
+        let (rows, groups) = (self.columns.rows(), self.columns.groups());
+        let sweep = self.sweep();
+        let comparison = self.comparison(&sweep);
+        let mut cells = DMatrix::zeros(count, rows * groups);
+        let mut by_jitter = DMatrix::zeros(frames.len(), rows * groups);
+        let mut jitters = DMatrix::zeros(count, frames.len());
+        let mut samples: Vec<Vec<RowSample>> = (0..rows).map(|_| Vec::new()).collect();
+        for (index, own) in frames.iter().enumerate() {
+            let frame = &self.frames[own.frame];
+            let late = (self.late_us[own.frame], self.longer_us(own.frame));
+            jitters.set_column(index, &(&own.mixed / own.weight));
+            comparison.visit(frame, late, BoardSamples::OnEdges, |row, opening, closing, sums| {
+                let edges = self.edges(own.frame, row, opening, closing);
+                for group in 0..groups {
+                    let cell = row * groups + group;
+                    let sums = comparison.compare(frame, row, group..group + 1, (opening, closing), false);
+                    let residuals = [-sums.opening_residual, sums.closing_residual];
+                    for (edge, residual) in edges.iter().zip(residuals) {
+                        edge.entries().iter().for_each(|&(a, x)| cells[(a, cell)] += residual * x);
+                        by_jitter[(index, cell)] -= residual;
+                    }
+                }
+                samples[row].push(RowSample { frame: index, edges, sums: *sums });
+            });
+        }
+        cells -= &jitters * by_jitter;
+        let summed = |clusters: usize, cluster: &dyn Fn(usize, usize) -> usize| {
+            let mut sums = DMatrix::zeros(count, clusters);
+            for (row, group) in (0..rows).flat_map(|row| (0..groups).map(move |group| (row, group))) {
+                let mut sum = sums.column_mut(cluster(row, group));
+                sum += cells.column(row * groups + group);
+            }
+            &sums * sums.transpose()
+        };
+        let blocks = rows.div_ceil(BLOCK_ROWS);
+        let by_block = summed(blocks * groups, &|row, group| row / BLOCK_ROWS * groups + group);
+        let mut scatter = by_block - &cells * cells.transpose();
+        scatter += &jitters * jitters.transpose() * self.jitter_prior_us.powi(-2);
+        let mut right = DVector::zeros(count);
+        self.add_priors(&mut scatter, &mut right, free);
+        let inverse = matrix.clone().cholesky().ok_or(TimesError::Undetermined)?.inverse();
+        let mut covariance = &inverse * scatter * &inverse;
+        for (row, samples) in samples.iter().enumerate().filter(|(_, samples)| !samples.is_empty()) {
+            let score = cells.columns(row * groups, groups).column_sum();
+            let others = &matrix - information(samples, &jitters);
+            let change = others.cholesky().map_or_else(|| &inverse * &score, |others| others.solve(&score));
+            covariance.ger(1.0, &change, &change, 1.0);
+        }
+        // A difference of sums of squares may be slightly negative.
+        let mut eigen = ((&covariance + covariance.transpose()) / 2.0).symmetric_eigen();
+        let least = eigen.eigenvalues.amax() * 1e-12;
+        eigen.eigenvalues.apply(|value| *value = value.max(least));
+        Ok(eigen.recompose())
+    }
+
+    /// Modes of the covariance of the row starts, `[mode, row]`, and the standard deviations of the row starts.
+    pub(super) fn modes(
+        &self,
+        covariance: &DMatrix<f64>,
+    ) -> Result<(ndarray::Array2<f64>, Vec<f64>), TimesError> {
+        let rows = self.nominal.projector_rows + 1;
+        let count = self.table.coefficients;
+        let root = covariance.view((0, 0), (count, count)).clone_owned();
+        let root = root.cholesky().ok_or(TimesError::Undetermined)?.l();
+        let mut factor = DMatrix::zeros(rows, count);
+        for row in 0..rows {
+            let (first, weights) = self.table.weights(row);
+            for (index, weight) in weights.iter().enumerate() {
+                for column in 0..=first + index {
+                    factor[(row, column)] += weight * root[(first + index, column)];
+                }
+            }
+        }
+        // The covariance is factor * factor'. What its mean and its slope over the rows seen explain, is split off.
+        let seen = self.columns.seen_rows();
+        let length = seen.len() as f64 + 1.0;
+        let offset = DVector::from_fn(rows, |row, _| f64::from(row >= seen.start && row <= seen.end));
+        let middle = (seen.start + seen.end) as f64 / 2.0;
+        let slope = DVector::from_fn(rows, |row, _| offset[row] * (row as f64 - middle) / length);
+        let mut modes: Vec<DVector<f64>> = Vec::new();
+        let whole = factor.clone();
+        for direction in [offset, slope] {
+            let along = factor.tr_mul(&direction);
+            let along = &along / along.norm().max(f64::MIN_POSITIVE);
+            let mode = &factor * &along;
+            factor.ger(-1.0, &mode, &along, 1.0);
+            modes.push(mode);
+        }
+        // Beyond the rows seen, the sweep may bend: early by a share of the sweep in its middle is this curvature.
+        let curvature_us = 8.0 * BEND * self.nominal.row_time_us / self.nominal.projector_rows as f64;
+        let bend = |away: usize| curvature_us * (away as f64).powi(2) / 2.0;
+        modes.push(DVector::from_fn(rows, |row, _| bend(seen.start.saturating_sub(row))));
+        modes.push(DVector::from_fn(rows, |row, _| bend(row.saturating_sub(seen.end))));
+        let variance =
+            |row: usize| whole.row(row).norm_squared() + modes[2][row].powi(2) + modes[3][row].powi(2);
+        let sd_us = (0..rows).map(|row| variance(row).sqrt()).collect();
+        // Beyond the rows seen, the largest modes would be those of the extrapolation, which the bend covers.
+        let inside = factor.rows(seen.start, seen.len() + 1).clone_owned();
+        let eigen = inside.tr_mul(&inside).symmetric_eigen();
+        let mut order: Vec<usize> = (0..count).collect();
+        order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]));
+        let mut rest: f64 = eigen.eigenvalues.iter().sum();
+        let enough = MODES_REST * rest;
+        for index in order {
+            if rest <= enough {
+                break;
+            }
+            rest -= eigen.eigenvalues[index];
+            modes.push(&factor * eigen.eigenvectors.column(index));
+        }
+        let modes = ndarray::Array2::from_shape_fn((modes.len(), rows), |(mode, row)| modes[mode][row]);
+        Ok((modes, sd_us))
+    }
+}
+
+/// The part of the normal matrix that comes from the samples of one camera row. `jitters`, `[unknown, frame]`, says how the
+/// jitter of each frame goes with the unknowns.
+fn information(samples: &[RowSample], jitters: &DMatrix<f64>) -> DMatrix<f64> {
+    let count = jitters.nrows();
+    let (mut matrix, mut right) = (DMatrix::zeros(count, count), DVector::zeros(count));
+    let mut mixed = DMatrix::zeros(count, samples.len());
+    let mut late = DMatrix::zeros(count, samples.len());
+    for (index, RowSample { frame, edges, sums }) in samples.iter().enumerate() {
+        let mut own = FrameNormal { frame: *frame, mixed: DVector::zeros(count), weight: 0.0, right: 0.0 };
+        own.add(edges, sums, &mut matrix, &mut right);
+        let jitter = jitters.column(*frame);
+        mixed.set_column(index, &(jitter * (own.weight / 2.0) - own.mixed));
+        late.set_column(index, &jitter);
+    }
+    let with_jitter = mixed * late.transpose();
+    matrix + &with_jitter + with_jitter.transpose()
+}
