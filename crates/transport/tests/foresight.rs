@@ -6,15 +6,19 @@
 #[allow(dead_code)]
 mod common;
 
+use std::ops::RangeInclusive;
+
 use common::{ELECTRONS_PER_COUNT, READ_NOISE_ELECTRONS, WHITE_COUNTS, open, paper_sweep, photographed_in};
-use ndarray::{Array3, s};
+use ndarray::{Array2, Array3, s};
 use rand_distr::{Distribution, StandardNormal};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use rand_xoshiro::rand_core::SeedableRng;
 use raysweep_transport::plane::advice::{
     Arrangement, Calibrated, Conditions, Design, Noise, PredictedError, Proposal, Search, SweepGrid, Usable,
 };
-use raysweep_transport::plane::{Demux, Prior, RowTiming, Setting};
+use raysweep_transport::plane::{
+    Demux, LightSums, NoiseModel, Prior, RowTiming, Samples, Setting, Transport, Uncertainty,
+};
 use raysweep_transport::quality::median_profile_error;
 
 const SCENES: [&str; 5] = ["corner", "wax", "bodies1", "bodies2", "bodies3"];
@@ -109,8 +113,8 @@ fn true_settings(plan: &Plan, seed: u64) -> Vec<Setting> {
     plan.settings.iter().map(late).collect()
 }
 
-/// Median error of the profiles of a scene's sampled pixels, `[v, t, s]` for the camera rows of [`rows`].
-fn measured_once(transport: &Array3<f32>, plan: &Plan, seed: u64) -> f64 {
+/// The images of a scene's sampled pixels, `[settings, rows, s]`, without noise.
+fn images(transport: &Array3<f32>, plan: &Plan, seed: u64) -> Array3<f32> {
     let (timing, rows) = (timing(), rows());
     let (_, height, width) = transport.dim();
     let mut stack = Array3::<f32>::zeros((plan.settings.len(), height, width));
@@ -121,11 +125,13 @@ fn measured_once(transport: &Array3<f32>, plan: &Plan, seed: u64) -> f64 {
             }
         }
     }
-    let stack = photographed_in(plan.frames as usize, &stack, seed);
-    let demux = Demux::new(timing, plan.settings.clone(), Prior::SPLIT).unwrap();
-    let estimate = demux.solve_rows(&rows, stack.view(), None, &|| true).unwrap();
-    let reach = demux.reach();
-    let mut truth = Array3::zeros(estimate.t.dim());
+    stack
+}
+
+/// The light of the sampled pixels from the rows within the reach, `[reach, rows, s]`.
+fn truth(transport: &Array3<f32>, reach: RangeInclusive<i32>) -> Array3<f32> {
+    let (rows, (_, _, width)) = (rows(), transport.dim());
+    let mut truth = Array3::zeros((reach.clone().count(), rows.len(), width));
     for (at, &t) in rows.iter().enumerate() {
         for (index, u) in reach.clone().enumerate() {
             if let Some(v) = t.checked_add_signed(u as isize).filter(|&v| v < 128) {
@@ -133,6 +139,16 @@ fn measured_once(transport: &Array3<f32>, plan: &Plan, seed: u64) -> f64 {
             }
         }
     }
+    truth
+}
+
+/// Median error of the profiles of a scene's sampled pixels, `[v, t, s]` for the camera rows of [`rows`].
+fn measured_once(transport: &Array3<f32>, plan: &Plan, seed: u64) -> f64 {
+    let (timing, rows) = (timing(), rows());
+    let stack = photographed_in(plan.frames as usize, &images(transport, plan, seed), seed);
+    let demux = Demux::new(timing, plan.settings.clone(), Prior::SPLIT).unwrap();
+    let estimate = demux.solve_rows(&rows, stack.view(), None, &|| true).unwrap();
+    let truth = truth(transport, demux.reach());
     median_profile_error(estimate.t.view(), truth.view())
 }
 
@@ -205,4 +221,77 @@ fn searched_plans_are_as_good_on_scenes_that_the_search_does_not_know() {
     let sweep = search(Arrangement::Sweep, even(-1500.0, 1500.0, 15), vec![600.0, 1200.0]);
     let sweep = errors(&sweep.of_frames(120).unwrap().unwrap());
     assert!(sweep.iter().all(|&error| error <= 0.032), "{sweep:?}");
+}
+
+/// The bound on the prior's bias against the biases of scenes that are not in the family.
+#[test]
+fn biases_lie_within_their_bound() {
+    const RUNS: u64 = 6;
+    const NAMES: [&str; 5] = ["paper 75x8", "60+15 x8", "film new", "even 15", "quick"];
+    let bands: Vec<Vec<RangeInclusive<i32>>> =
+        vec![vec![0..=0], vec![-3..=-3, 3..=3], vec![-10..=-1, 1..=10], vec![-40..=-11, 11..=40]];
+    let (timing, rows, scenes) = (timing(), rows(), scenes());
+    let counts = WHITE_COUNTS * ELECTRONS_PER_COUNT;
+    for plan in plans().into_iter().filter(|plan| NAMES.contains(&plan.name)) {
+        let demux = Demux::new(timing.clone(), plan.settings.clone(), Prior::SPLIT).unwrap();
+        let frames = vec![plan.frames as usize; plan.settings.len()];
+        let model = Uncertainty {
+            timing: &timing,
+            settings: &plan.settings,
+            prior: Prior::SPLIT,
+            noise: NoiseModel { read_variance: noise(1).read.powi(2), gain: counts.recip() },
+            frames: &frames,
+            delay_sds_us: &vec![0.0; frames.len()],
+            darks: &[],
+            calibration: None,
+        };
+        let sums = LightSums::Bands(&bands);
+        let bounds = model.bias_bounds(128, &sums).unwrap();
+        let mut within = vec![Vec::new(); bands.len()];
+        let mut widths = vec![Vec::new(); bands.len()];
+        for scene in &scenes {
+            let ideal = images(scene, &plan, 0);
+            let stack = |seed| photographed_in(plan.frames as usize, &ideal, seed);
+            let solved = |stack: &Array3<f32>| demux.solve_rows(&rows, stack.view(), None, &|| true).unwrap();
+            let lights = |t: &Array3<f32>| -> Vec<Array2<f32>> {
+                let of = |band: &Vec<RangeInclusive<i32>>| {
+                    let within = |u: i32| band.iter().any(|range| range.contains(&u));
+                    let lit = demux.reach().zip(t.outer_iter()).filter(|(u, _)| within(*u));
+                    lit.fold(Array2::zeros((t.dim().1, t.dim().2)), |sum, (_, row)| sum + row)
+                };
+                bands.iter().map(of).collect()
+            };
+            let first = stack(1);
+            let estimate = solved(&first);
+            let mut means = lights(&estimate.t);
+            for seed in 2..=RUNS {
+                let others = lights(&solved(&stack(seed)).t);
+                means.iter_mut().zip(others).for_each(|(mean, light)| *mean += &light);
+            }
+            let truths = lights(&truth(scene, demux.reach()));
+            for (at, &t) in rows.iter().enumerate() {
+                let one = s![.., at..at + 1, ..];
+                let exists = estimate.exists.slice(s![.., at..at + 1]).to_owned();
+                let of_row = Transport::measured(estimate.t.slice(one).to_owned(), estimate.u_min, exists);
+                let samples =
+                    Samples { stack: first.slice(one), valid: None, variance_ratio: None, u0_rows: None };
+                let bias = model.prior_bias_in_rows(t, &of_row, &samples, &sums, &bounds).unwrap();
+                for band in 0..bands.len() {
+                    for column in 0..scene.dim().2 {
+                        let mean = means[band][[at, column]] / RUNS as f32;
+                        let (off, bound) = (mean - truths[band][[at, column]], bias[[band, 0, column]]);
+                        within[band].push(off.abs() <= bound);
+                        widths[band].push(f64::from(bound / truths[band][[at, column]].max(1e-6)));
+                    }
+                }
+            }
+        }
+        let shares: Vec<f64> = within
+            .iter()
+            .map(|within| within.iter().filter(|within| **within).count() as f64 / within.len() as f64)
+            .collect();
+        let widths: Vec<f64> = widths.into_iter().map(median).collect();
+        println!("{:12} within {shares:.3?}, median bound over light {widths:.3?}, {bounds:?}", plan.name);
+        assert!(shares.iter().all(|&share| share >= 0.93), "{shares:?}");
+    }
 }

@@ -2,6 +2,7 @@
 
 use ndarray::{Array2, Array3, Axis, s};
 use raysweep_transport::plane::Transport;
+use raysweep_transport::plane::advice::BiasBound;
 
 use super::mask;
 use super::profile::ProfileSums;
@@ -38,12 +39,14 @@ pub struct Assembly {
     /// The product of each strip so far; empty for a profile.
     parts: Vec<Product>,
     sums: ProfileSums,
+    /// Those of a `prior-bias`, the same in all strips.
+    bounds: Vec<BiasBound>,
 }
 
 impl Assembly {
     /// Starts a product.
     pub fn new(spec: ProductSpec) -> Self {
-        Self { spec, parts: Vec::new(), sums: ProfileSums::default() }
+        Self { spec, parts: Vec::new(), sums: ProfileSums::default(), bounds: Vec::new() }
     }
 
     /// The product's name.
@@ -88,7 +91,7 @@ impl Assembly {
                 of.make(name, first_row, stack, transport, mask).map_err(not_made)?
             }
             ProductKind::PriorBias(of) => {
-                of.make_bias(name, first_row, stack, transport, mask).map_err(not_made)?
+                of.make_bias(name, first_row, stack, transport, mask, &mut self.bounds).map_err(not_made)?
             }
             ProductKind::DelayProfile(options) => {
                 options.add(&mut self.sums, first_row, stack, transport);
@@ -104,7 +107,7 @@ impl Assembly {
     /// # Errors
     /// If a required image saturates.
     pub fn finish(self) -> Result<Product, NotMade> {
-        let Self { spec: ProductSpec { name, kind }, parts, sums } = self;
+        let Self { spec: ProductSpec { name, kind }, parts, sums, .. } = self;
         if let ProductKind::DelayProfile(options) = kind {
             return options.make(name.clone(), &sums).map_err(|what| NotMade { name, what });
         }

@@ -1,9 +1,10 @@
 //! How far to trust the light of a band or of a relit image: `uncertainty`, the standard deviation, and `prior-bias`,
-//! what the prior may add.
+//! a bound on what the prior adds.
 
 use std::ops::RangeInclusive;
 
 use ndarray::{Array2, Array3, Axis};
+use raysweep_transport::plane::advice::BiasBound;
 use raysweep_transport::plane::{LightSums, NoiseModel, PlaneError, Samples, Transport, Uncertainty};
 
 use super::band::Band;
@@ -65,7 +66,7 @@ impl LightOf {
         Ok(Product::Image { name, about, image, mask })
     }
 
-    /// The size of the prior's bias for the same rows.
+    /// The bound on the prior's bias for the same rows. `bounds` are those of the first strip, computed if there are none.
     pub(super) fn make_bias(
         &self,
         name: String,
@@ -73,12 +74,16 @@ impl LightOf {
         stack: &SweepStack,
         transport: &Transport,
         mask: Array2<u8>,
+        bounds: &mut Vec<BiasBound>,
     ) -> Result<Product, String> {
-        let none = NoiseModel { read_variance: 0.0, gain: 0.0 };
-        let (says, image) = self.image(stack, none, |model, samples, sums| {
-            model.prior_bias_in_rows(first_row, transport, samples, sums)
+        let noise = stack.noise.unwrap_or(NoiseModel { read_variance: 0.0, gain: 0.0 });
+        let (says, image) = self.image(stack, noise, |model, samples, sums| {
+            if bounds.is_empty() {
+                *bounds = model.bias_bounds(transport.t.dim().2, sums)?;
+            }
+            model.prior_bias_in_rows(first_row, transport, samples, sums, bounds)
         })?;
-        let about = format!("size of the bias that the prior may give to {says}");
+        let about = format!("bound on the bias that the prior gives to {says}, for 95 % of the pixels");
         Ok(Product::Image { name, about, image, mask })
     }
 

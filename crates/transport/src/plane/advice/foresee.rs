@@ -2,7 +2,7 @@ use ndarray::{Array1, Array2, ArrayView1, Axis};
 
 use super::super::solve::pivot::{Start, minimise};
 use super::super::solve::quadratic::Quadratic;
-use super::super::{PlaneError, Prior, RowModel, RowTiming, Setting, SimdLevel, SlotKind, reach};
+use super::super::{PlaneError, Prior, RowModel, RowTiming, Setting, SimdLevel, Slot, SlotKind, reach};
 use super::family::{FamilyPixel, PIXELS_PER_SCENE, family};
 use super::random::Random;
 
@@ -33,7 +33,7 @@ impl Noise {
     }
 
     /// Images `[pixels, settings]` with noise added.
-    fn added(&self, settings: &[Setting], light: &Array2<f64>, draw: u64) -> Array2<f64> {
+    pub(super) fn added(&self, settings: &[Setting], light: &Array2<f64>, draw: u64) -> Array2<f64> {
         let mut noisy = light.clone();
         for (pixel, mut samples) in noisy.rows_mut().into_iter().enumerate() {
             let mut random = Random::new(DRAWS * pixel as u64 + draw);
@@ -179,7 +179,7 @@ impl Conditions<'_> {
     /// # Errors
     /// Those of [`reach`]; [`PlaneError::NotConvex`].
     pub fn foresee(&self, settings: &[Setting], noise: &Noise) -> Result<PredictedError, PlaneError> {
-        let pixels = Pixels::new(self, settings)?;
+        let pixels = Pixels::new(self.timing, &self.prior, settings)?;
         let light = pixels.light(settings, self.timing);
         let whole = pixels.solve_all(&light, None);
         let free = whole.mapv(|light| light > 0.0);
@@ -222,27 +222,27 @@ enum Division {
 }
 
 /// The pixels of the family, and the problem that each of them poses.
-struct Pixels {
+pub(super) struct Pixels {
     /// Light of each projector row, `[pixels, projector rows]`.
     transport: Array2<f64>,
     camera_row: usize,
+    pub slots: Vec<Slot>,
     weights: Array2<f64>,
-    quadratic: Quadratic,
+    pub quadratic: Quadratic,
     /// Slots within the reach.
-    own_slots: Vec<usize>,
+    pub own_slots: Vec<usize>,
     /// Those of `own_slots` within the direct band.
     direct_band: Vec<usize>,
     /// Light in these slots, `[pixels, own slots]`.
-    truth: Array2<f64>,
+    pub truth: Array2<f64>,
 }
 
 impl Pixels {
-    fn new(conditions: &Conditions<'_>, settings: &[Setting]) -> Result<Self, PlaneError> {
-        let timing = conditions.timing;
+    pub fn new(timing: &RowTiming, prior: &Prior, settings: &[Setting]) -> Result<Self, PlaneError> {
         let camera_row = timing.camera_rows() / 2;
         let RowModel { slots, weights } =
             RowModel::typical(timing, settings, &reach(timing, settings)?, camera_row);
-        let quadratic = Quadratic::new(weights.view(), &slots, &conditions.prior)?;
+        let quadratic = Quadratic::new(weights.view(), &slots, prior)?;
         let profiles: Vec<FamilyPixel> = family().concat();
         let own_slots: Vec<usize> =
             (0..slots.len()).filter(|&slot| slots[slot].kind == SlotKind::Own).collect();
@@ -255,11 +255,11 @@ impl Pixels {
         let transport = Array2::from_shape_fn((profiles.len(), timing.projector_rows()), |(pixel, v)| {
             profiles[pixel].light(v as i32 - own_row as i32)
         });
-        Ok(Self { transport, camera_row, weights, quadratic, own_slots, direct_band, truth })
+        Ok(Self { transport, camera_row, slots, weights, quadratic, own_slots, direct_band, truth })
     }
 
     /// Noise-free images, `[pixels, settings]`.
-    fn light(&self, settings: &[Setting], timing: &RowTiming) -> Array2<f64> {
+    pub fn light(&self, settings: &[Setting], timing: &RowTiming) -> Array2<f64> {
         let mut light = Array2::zeros((self.transport.nrows(), settings.len()));
         for (mut light, setting) in light.columns_mut().into_iter().zip(settings) {
             light.assign(&self.light_of(setting, timing));
@@ -274,7 +274,7 @@ impl Pixels {
     }
 
     /// Estimates of all slots, `[pixels, slots]`; the search starts from the free slots of similar estimates.
-    fn solve_all(&self, light: &Array2<f64>, near: Option<&Array2<bool>>) -> Array2<f64> {
+    pub fn solve_all(&self, light: &Array2<f64>, near: Option<&Array2<bool>>) -> Array2<f64> {
         let linear = self.quadratic.linear(self.weights.view(), light.view());
         let runs = vec![PIXELS_PER_SCENE; light.nrows() / PIXELS_PER_SCENE];
         let start = near.map_or(Start::Runs(&runs), |free| Start::Free(free.view()));

@@ -4,6 +4,7 @@
 //! pixels are photographed and solved as those of a run will be ([`Conditions::foresee`]). Plans are compared by that
 //! error ([`Search`]).
 
+mod bias;
 mod family;
 mod foresee;
 mod random;
@@ -11,6 +12,8 @@ mod search;
 
 use super::{RowTiming, Setting};
 
+pub use bias::BiasBound;
+pub(super) use bias::{BiasOfFamily, bias_sizes};
 pub use foresee::{Calibrated, Conditions, Noise, PredictedError, Spread};
 pub use search::{Advice, Arrangement, Design, Proposal, Search, SweepGrid, Usable};
 

@@ -4,6 +4,7 @@ use ndarray::{
     Array1, Array2, Array3, ArrayView1, ArrayView2, ArrayView3, ArrayViewMut1, ArrayViewMut2, Axis,
 };
 
+use super::super::advice::{BiasBound, BiasOfFamily, Noise, bias_sizes};
 use super::super::board::{CalibrationCovariance, CalibrationParameter};
 use super::super::error::check_shape;
 use super::super::noise::check_shapes;
@@ -127,12 +128,38 @@ impl Uncertainty<'_> {
         })
     }
 
-    /// Size of the bias that the prior gives to each sum, `[sums, t, s]`.
+    /// A bound on the bias that the prior gives to each sum, in the order of the sums, for [`Self::prior_bias_in_rows`].
     ///
-    /// Without noise, the estimate of a sum differs from the truth by `alpha (D g)'(D T) + beta/2 sum(g)`, where
-    /// `g = H_FF^-1 e` for the sum's weights `e`, and `T` the truth. Here the estimate is taken for the truth, and the
-    /// terms of the sum by their sizes, so that terms that cancel by chance do not hide the others. Where the truth is
-    /// rougher than the estimate shows, the bias may be larger.
+    /// The estimate does not show how rough the truth is, so the bound is taken from transports that are known: those
+    /// of the family of [`super::super::advice`], photographed with these settings and this noise in the middle of an
+    /// image of `columns` columns, and solved. It holds for 98 % of them, so that it holds for 95 % of the pixels of
+    /// other scenes.
+    ///
+    /// # Errors
+    /// Those of [`Self::of_bands`].
+    pub fn bias_bounds(&self, columns: usize, sums: &LightSums) -> Result<Vec<BiasBound>, PlaneError> {
+        self.timing.check(self.settings)?;
+        self.prior.check()?;
+        let middle = self.timing.camera_rows() / 2;
+        let sums = Sums::new(sums, self.timing, middle..middle + 1, columns)?;
+        let class = sums.class(0, columns / 2);
+        let mean = |frames: &mut dyn ExactSizeIterator<Item = usize>| {
+            let count = frames.len().max(1) as f64;
+            (frames.sum::<usize>() as f64 / count).round().max(1.0) as u32
+        };
+        let noise = Noise {
+            read: self.noise.read_variance.sqrt(),
+            gain: self.noise.gain,
+            frames: mean(&mut self.frames.iter().copied()),
+            dark_frames: (!self.darks.is_empty())
+                .then(|| mean(&mut self.darks.iter().map(|dark| dark.frames))),
+        };
+        let family = BiasOfFamily::new(self.timing, self.prior, self.settings, &noise)?;
+        (0..sums.len()).map(|index| family.bound(|u| sums.weight(index, class, u))).collect()
+    }
+
+    /// A bound on the bias that the prior gives to each sum, `[sums, t, s]`, with the bounds of [`Self::bias_bounds`]:
+    /// multiples of the bias that the estimate itself shows, and of the pixel's whole light.
     ///
     /// # Errors
     /// Those of [`Self::of_sums_in_rows`].
@@ -142,20 +169,21 @@ impl Uncertainty<'_> {
         transport: &Transport,
         samples: &Samples,
         sums: &LightSums,
+        bounds: &[BiasBound],
     ) -> Result<Array3<f32>, PlaneError> {
         let prior = self.prior;
         self.for_each_tile(first_row, transport, samples, sums, &|problem, tile, rows, sums| {
+            check_shape("bounds", "[sums]", &[bounds.len()], &[sums.len()])?;
             let solutions = problem.solutions(sums, transport.u_min, tile, rows)?;
             let differences = prior.differences(&problem.model.slots);
-            let rough = problem.light(transport.u_min, tile, rows).dot(&differences.t());
-            let stiff = solutions.dot(&differences.t());
+            let estimates = problem.light(transport.u_min, tile, rows);
+            let sizes = bias_sizes(&prior, &differences, &solutions, &estimates, sums.len());
             for (index, &(at, column)) in tile.pixels.iter().enumerate() {
-                for (sum, sd) in rows[at].data.out.column_mut(column).iter_mut().enumerate() {
-                    let row = index * sums.len() + sum;
-                    let smoothed =
-                        stiff.row(row).iter().zip(rough.row(index)).map(|(a, b)| (a * b).abs()).sum::<f64>();
-                    let sparse = solutions.row(row).sum().abs();
-                    *sd = (prior.alpha() * smoothed + prior.beta() / 2.0 * sparse) as f32;
+                let light = estimates.row(index).sum();
+                let out = rows[at].data.out.column_mut(column);
+                for (sum, (out, bound)) in out.into_iter().zip(bounds).enumerate() {
+                    let size = sizes[index * sums.len() + sum];
+                    *out = (bound.of_size * size + bound.of_light * light) as f32;
                 }
             }
             Ok(())
