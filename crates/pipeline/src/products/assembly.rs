@@ -2,7 +2,7 @@
 
 use ndarray::{Array2, Array3, Axis, s};
 use raysweep_transport::plane::Transport;
-use raysweep_transport::plane::advice::BiasBound;
+use raysweep_transport::plane::advice::BiasOfFamily;
 
 use super::mask;
 use super::profile::ProfileSums;
@@ -39,14 +39,14 @@ pub struct Assembly {
     /// The product of each strip so far; empty for a profile.
     parts: Vec<Product>,
     sums: ProfileSums,
-    /// Those of a `prior-bias`, the same in all strips.
-    bounds: Vec<BiasBound>,
+    /// What a `prior-bias` is taken from, the same for all strips.
+    family: Option<BiasOfFamily>,
 }
 
 impl Assembly {
     /// Starts a product.
     pub fn new(spec: ProductSpec) -> Self {
-        Self { spec, parts: Vec::new(), sums: ProfileSums::default(), bounds: Vec::new() }
+        Self { spec, parts: Vec::new(), sums: ProfileSums::default(), family: None }
     }
 
     /// The product's name.
@@ -91,7 +91,7 @@ impl Assembly {
                 of.make(name, first_row, stack, transport, mask).map_err(not_made)?
             }
             ProductKind::PriorBias(of) => {
-                of.make_bias(name, first_row, stack, transport, mask, &mut self.bounds).map_err(not_made)?
+                of.make_bias(name, first_row, stack, transport, mask, &mut self.family).map_err(not_made)?
             }
             ProductKind::DelayProfile(options) => {
                 options.add(&mut self.sums, first_row, stack, transport);

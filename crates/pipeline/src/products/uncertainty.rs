@@ -4,7 +4,7 @@
 use std::ops::RangeInclusive;
 
 use ndarray::{Array2, Array3, Axis};
-use raysweep_transport::plane::advice::BiasBound;
+use raysweep_transport::plane::advice::BiasOfFamily;
 use raysweep_transport::plane::{LightSums, NoiseModel, PlaneError, Samples, Transport, Uncertainty};
 
 use super::band::Band;
@@ -66,7 +66,7 @@ impl LightOf {
         Ok(Product::Image { name, about, image, mask })
     }
 
-    /// The bound on the prior's bias for the same rows. `bounds` are those of the first strip, computed if there are none.
+    /// The bound on the prior's bias for the same rows. `family` is that of the first strip.
     pub(super) fn make_bias(
         &self,
         name: String,
@@ -74,14 +74,15 @@ impl LightOf {
         stack: &SweepStack,
         transport: &Transport,
         mask: Array2<u8>,
-        bounds: &mut Vec<BiasBound>,
+        family: &mut Option<BiasOfFamily>,
     ) -> Result<Product, String> {
         let noise = stack.noise.unwrap_or(NoiseModel { read_variance: 0.0, gain: 0.0 });
         let (says, image) = self.image(stack, noise, |model, samples, sums| {
-            if bounds.is_empty() {
-                *bounds = model.bias_bounds(transport.t.dim().2, sums)?;
-            }
-            model.prior_bias_in_rows(first_row, transport, samples, sums, bounds)
+            let family = match family {
+                Some(family) => family,
+                None => family.insert(model.bias_of_family()?),
+            };
+            model.prior_bias_in_rows(first_row, transport, samples, sums, family)
         })?;
         let about = format!("bound on the bias that the prior gives to {says}, for 95 % of the pixels");
         Ok(Product::Image { name, about, image, mask })

@@ -19,7 +19,7 @@
 //! itself.
 //!
 //! The folders import each other in one direction: `solve` imports `model`; [`calibrate`], `products` and [`advice`]
-//! import both, and `noise`.
+//! import both, and `noise`; `products` imports [`advice`], too, for the family of scenes that it bounds biases with.
 
 pub mod advice;
 pub mod board;

@@ -11,7 +11,8 @@ const DRAWS: u64 = 4;
 const WITHIN: f64 = 0.98;
 
 /// How far estimates of sums of the family's light are from the truth, beside what the prior is seen to do to them.
-pub(in super::super) struct BiasOfFamily {
+#[derive(Debug)]
+pub struct BiasOfFamily {
     pixels: Pixels,
     /// Estimates of all slots, `[pixels, slots]`, of each noise pattern.
     estimates: Vec<Array2<f64>>,
@@ -20,16 +21,26 @@ pub(in super::super) struct BiasOfFamily {
 
 /// A bound on the bias of a sum of light, as multiples of what is known of a pixel.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct BiasBound {
+pub(in super::super) struct BiasBound {
     /// Of the size of the bias that the estimate itself shows.
-    pub(in super::super) of_size: f64,
+    pub of_size: f64,
     /// Of the pixel's whole light: the estimate does not show what smoothing has already removed.
-    pub(in super::super) of_light: f64,
+    pub of_light: f64,
+}
+
+impl BiasBound {
+    /// That of a sum without light.
+    pub const NONE: Self = Self { of_size: 0.0, of_light: 0.0 };
+
+    /// A bound where either holds.
+    pub fn or_larger(self, other: Self) -> Self {
+        Self { of_size: self.of_size.max(other.of_size), of_light: self.of_light.max(other.of_light) }
+    }
 }
 
 impl BiasOfFamily {
     /// Photographs and solves the family.
-    pub fn new(
+    pub(in super::super) fn new(
         timing: &RowTiming,
         prior: Prior,
         settings: &[Setting],
@@ -46,36 +57,34 @@ impl BiasOfFamily {
     }
 
     /// The bound on a sum in which the light of relative row `u` has the weight `weight(u)`.
-    pub fn bound(&self, weight: impl Fn(i32) -> f64) -> Result<BiasBound, PlaneError> {
+    pub(in super::super) fn bound(&self, weight: impl Fn(i32) -> f64) -> Result<BiasBound, PlaneError> {
         let Pixels { slots, quadratic, own_slots, truth, .. } = &self.pixels;
         let of_own: Array1<f64> = own_slots.iter().map(|&slot| weight(slots[slot].u)).collect();
         let mut of_slots = Array1::zeros(slots.len());
         own_slots.iter().zip(&of_own).for_each(|(&slot, &weight)| of_slots[slot] = weight);
+        if of_own.iter().all(|&weight| weight == 0.0) {
+            return Ok(BiasBound::NONE);
+        }
         let differences = self.prior.differences(slots);
         let own = |estimate: &Array2<f64>| estimate.select(Axis(1), own_slots);
         let sums = self.estimates.iter().map(|estimate| own(estimate).dot(&of_own));
         let mean = sums.fold(Array1::zeros(truth.nrows()), |sum, of| sum + of) / self.estimates.len() as f64;
         let bias = (mean - truth.dot(&of_own)).mapv(f64::abs);
-        // Of each estimate: its bias, the size that it shows, and its light.
-        let mut seen: Vec<[f64; 3]> = Vec::new();
-        for estimate in &self.estimates {
-            let mut linear = Array2::zeros(estimate.dim());
-            linear.rows_mut().into_iter().for_each(|mut row| row.assign(&of_slots));
-            let free = estimate.mapv(|light| light > 0.0);
-            let solutions = minimise_free(SimdLevel::best(), quadratic, linear, free.view());
-            if !solutions.iter().all(|entry| entry.is_finite()) {
-                return Err(PlaneError::NotConvex);
-            }
-            let sizes = bias_sizes(&self.prior, &differences, &solutions, estimate, 1);
-            let light = own(estimate).sum_axis(Axis(1));
-            seen.extend(
-                bias.iter().zip(&sizes).zip(&light).map(|((&bias, &size), &light)| [bias, size, light]),
-            );
+        // What the first estimate shows of it: its size, and the light.
+        let estimate = &self.estimates[0];
+        let mut linear = Array2::zeros(estimate.dim());
+        linear.rows_mut().into_iter().for_each(|mut row| row.assign(&of_slots));
+        let free = estimate.mapv(|light| light > 0.0);
+        let solutions = minimise_free(SimdLevel::best(), quadratic, linear, free.view());
+        if !solutions.iter().all(|entry| entry.is_finite()) {
+            return Err(PlaneError::NotConvex);
         }
+        let sizes = bias_sizes(&self.prior, &differences, &solutions, estimate, 1);
+        let light = own(estimate).sum_axis(Axis(1));
+        let median = |of: &Array1<f64>| quantile(of.to_vec(), 0.5);
         // Both parts count alike for a typical pixel.
-        let median = |index: usize| quantile(seen.iter().map(|seen| seen[index]).collect(), 0.5);
-        let light_share = median(1) / median(2).max(f64::MIN_POSITIVE);
-        let ratios = seen.iter().map(|[bias, size, light]| {
+        let light_share = median(&sizes) / median(&light).max(f64::MIN_POSITIVE);
+        let ratios = bias.iter().zip(&sizes).zip(&light).map(|((bias, size), light)| {
             let scale = size + light_share * light;
             if scale > 0.0 { bias / scale } else { 0.0 }
         });

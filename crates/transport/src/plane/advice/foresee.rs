@@ -222,6 +222,7 @@ enum Division {
 }
 
 /// The pixels of the family, and the problem that each of them poses.
+#[derive(Debug)]
 pub(super) struct Pixels {
     /// Light of each projector row, `[pixels, projector rows]`.
     transport: Array2<f64>,

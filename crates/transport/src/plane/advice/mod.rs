@@ -12,8 +12,8 @@ mod search;
 
 use super::{RowTiming, Setting};
 
-pub use bias::BiasBound;
-pub(super) use bias::{BiasOfFamily, bias_sizes};
+pub use bias::BiasOfFamily;
+pub(super) use bias::{BiasBound, bias_sizes};
 pub use foresee::{Calibrated, Conditions, Noise, PredictedError, Spread};
 pub use search::{Advice, Arrangement, Design, Proposal, Search, SweepGrid, Usable};
 

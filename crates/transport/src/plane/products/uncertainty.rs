@@ -3,6 +3,7 @@ use std::ops::{Range, RangeInclusive};
 use ndarray::{
     Array1, Array2, Array3, ArrayView1, ArrayView2, ArrayView3, ArrayViewMut1, ArrayViewMut2, Axis,
 };
+use rayon::prelude::*;
 
 use super::super::advice::{BiasBound, BiasOfFamily, Noise, bias_sizes};
 use super::super::board::{CalibrationCovariance, CalibrationParameter};
@@ -128,21 +129,14 @@ impl Uncertainty<'_> {
         })
     }
 
-    /// A bound on the bias that the prior gives to each sum, in the order of the sums, for [`Self::prior_bias_in_rows`].
-    ///
-    /// The estimate does not show how rough the truth is, so the bound is taken from transports that are known: those
-    /// of the family of [`super::super::advice`], photographed with these settings and this noise in the middle of an
-    /// image of `columns` columns, and solved. It holds for 98 % of them, so that it holds for 95 % of the pixels of
-    /// other scenes.
+    /// The family of [`super::super::advice`], photographed with these settings and this noise in the middle of the image,
+    /// and solved, for [`Self::prior_bias_in_rows`].
     ///
     /// # Errors
     /// Those of [`Self::of_bands`].
-    pub fn bias_bounds(&self, columns: usize, sums: &LightSums) -> Result<Vec<BiasBound>, PlaneError> {
+    pub fn bias_of_family(&self) -> Result<BiasOfFamily, PlaneError> {
         self.timing.check(self.settings)?;
         self.prior.check()?;
-        let middle = self.timing.camera_rows() / 2;
-        let sums = Sums::new(sums, self.timing, middle..middle + 1, columns)?;
-        let class = sums.class(0, columns / 2);
         let mean = |frames: &mut dyn ExactSizeIterator<Item = usize>| {
             let count = frames.len().max(1) as f64;
             (frames.sum::<usize>() as f64 / count).round().max(1.0) as u32
@@ -154,12 +148,14 @@ impl Uncertainty<'_> {
             dark_frames: (!self.darks.is_empty())
                 .then(|| mean(&mut self.darks.iter().map(|dark| dark.frames))),
         };
-        let family = BiasOfFamily::new(self.timing, self.prior, self.settings, &noise)?;
-        (0..sums.len()).map(|index| family.bound(|u| sums.weight(index, class, u))).collect()
+        BiasOfFamily::new(self.timing, self.prior, self.settings, &noise)
     }
 
-    /// A bound on the bias that the prior gives to each sum, `[sums, t, s]`, with the bounds of [`Self::bias_bounds`]:
-    /// multiples of the bias that the estimate itself shows, and of the pixel's whole light.
+    /// A bound on the bias that the prior gives to each sum, `[sums, t, s]`: a multiple of the bias that the estimate
+    /// itself shows, and of the pixel's whole light.
+    ///
+    /// The estimate does not show how rough the truth is, so the multiples are taken from transports that are known,
+    /// those of `family`. The bound holds for 98 % of them, so that it holds for 95 % of the pixels of other scenes.
     ///
     /// # Errors
     /// Those of [`Self::of_sums_in_rows`].
@@ -169,19 +165,23 @@ impl Uncertainty<'_> {
         transport: &Transport,
         samples: &Samples,
         sums: &LightSums,
-        bounds: &[BiasBound],
+        family: &BiasOfFamily,
     ) -> Result<Array3<f32>, PlaneError> {
+        self.check(first_row, transport, samples)?;
+        let (_, rows, columns) = transport.t.dim();
+        let of_rows = Sums::new(sums, self.timing, first_row..first_row + rows, columns)?;
+        let bounds = of_rows.bias_bounds(family, rows, columns)?;
         let prior = self.prior;
         self.for_each_tile(first_row, transport, samples, sums, &|problem, tile, rows, sums| {
-            check_shape("bounds", "[sums]", &[bounds.len()], &[sums.len()])?;
             let solutions = problem.solutions(sums, transport.u_min, tile, rows)?;
             let differences = prior.differences(&problem.model.slots);
             let estimates = problem.light(transport.u_min, tile, rows);
             let sizes = bias_sizes(&prior, &differences, &solutions, &estimates, sums.len());
             for (index, &(at, column)) in tile.pixels.iter().enumerate() {
                 let light = estimates.row(index).sum();
-                let out = rows[at].data.out.column_mut(column);
-                for (sum, (out, bound)) in out.into_iter().zip(bounds).enumerate() {
+                let Data { t, out, .. } = &mut rows[at].data;
+                let bounds = &bounds[*t];
+                for (sum, (out, bound)) in out.column_mut(column).into_iter().zip(bounds).enumerate() {
                     let size = sizes[index * sums.len() + sum];
                     *out = (bound.of_size * size + bound.of_light * light) as f32;
                 }
@@ -335,6 +335,38 @@ impl<'a> Sums<'a> {
         match self {
             Self::Bands(_) => None,
             Self::Relit(rows) => rows[t].iter().find(|class| class.columns.binary_search(&column).is_ok()),
+        }
+    }
+
+    /// The bounds of each sum in each camera row, `[rows][sums]`. Under other light, it is the largest of those of the row's
+    /// first, middle and last pixel.
+    fn bias_bounds(
+        &self,
+        family: &BiasOfFamily,
+        rows: usize,
+        columns: usize,
+    ) -> Result<Vec<Vec<BiasBound>>, PlaneError> {
+        let of_class =
+            |index: usize, class: Option<&LitClass>| family.bound(|u| self.weight(index, class, u));
+        match self {
+            Self::Bands(bands) => {
+                let bounds = (0..bands.len()).map(|index| of_class(index, None)).collect::<Result<_, _>>()?;
+                Ok(vec![bounds; rows])
+            }
+            Self::Relit(_) => (0..rows)
+                .into_par_iter()
+                .map(|t| {
+                    let mut classes: Vec<&LitClass> = Vec::new();
+                    for class in [0, columns / 2, columns - 1].iter().filter_map(|&s| self.class(t, s)) {
+                        if !classes.iter().any(|other| std::ptr::eq(*other, class)) {
+                            classes.push(class);
+                        }
+                    }
+                    let bounds = classes.into_iter().map(|class| of_class(0, Some(class)));
+                    let largest = bounds.reduce(|a, b| Ok(a?.or_larger(b?)));
+                    largest.unwrap_or(Ok(BiasBound::NONE)).map(|bound| vec![bound])
+                })
+                .collect(),
         }
     }
 
