@@ -296,6 +296,10 @@ fn biases_lie_within_their_bound() {
                     let truths = sums(truth.slice(s![.., at, column]), t);
                     for (sum, bound) in bounds.iter().enumerate() {
                         let bound = f64::from(bound[[0, column]]);
+                        // A pixel none of whose rows within the reach is in the sum tells nothing.
+                        if truths[sum] == 0.0 {
+                            continue;
+                        }
                         within[sum].push(f64::from(u8::from((found[sum] - truths[sum]).abs() <= bound)));
                         widths[sum].push(bound / truths[sum].max(1e-6));
                     }
@@ -306,7 +310,9 @@ fn biases_lie_within_their_bound() {
             within.iter().map(|within| within.iter().sum::<f64>() / within.len() as f64).collect();
         let widths: Vec<f64> = widths.into_iter().map(median).collect();
         println!("{:12} within {shares:.3?}, median bound over light {widths:.3?}", plan.name);
-        assert!(shares.iter().all(|&share| share >= 0.9), "{shares:?}");
+        assert!(shares.iter().all(|&share| share >= 0.93), "{shares:?}");
+        // Wide bounds hold, too: those of direct light and of the stripes say something with every plan.
+        assert!(widths[0] < 0.6 && widths[5] < 0.4, "{widths:?}");
     }
 }
 

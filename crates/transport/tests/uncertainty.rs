@@ -489,3 +489,49 @@ fn relit_images_spread_as_predicted() {
         assert!((0.63..0.73).contains(&share), "{beam:?}: {share}");
     }
 }
+
+/// On a tilted rig, pixels of one camera row look at projector rows far apart: each has the bound of its own, and the same
+/// whether its camera row is judged alone or with others.
+#[test]
+fn the_bias_of_a_relit_image_is_bounded_at_every_pixel_of_a_tilted_rig() {
+    let (rows, columns) = (62..66, 16);
+    let place = Array2::from_shape_fn((4, columns), |(t, s)| 40.3 + t as f32 + 3.0 * s as f32);
+    let mut beam = [0.0; RESPONSE_ROWS];
+    (beam[6], beam[7], beam[8]) = (0.2, 0.7, 0.1);
+    let response = PixelResponse::with_beam(place, &beam).unwrap();
+    let timing = timing().window(rows.start, rows.len()).unwrap().with_response(response).unwrap();
+    let demux = Demux::new(timing.clone(), paper_sweep(), Prior::SPLIT).unwrap();
+    let stack = Array3::from_elem((75, 4, columns), 0.4_f32);
+    let estimate = demux.solve(stack.view(), None).unwrap();
+    let model = Uncertainty {
+        timing: &timing,
+        settings: &paper_sweep(),
+        prior: Prior::SPLIT,
+        noise: camera_noise(),
+        frames: &[8; 75],
+        delay_sds_us: &[0.0; 75],
+        darks: &[],
+        calibration: None,
+    };
+    let family = model.bias_of_family().unwrap();
+    let lit = Array1::from_shape_fn(timing.projector_rows(), |v| f64::from(u8::from((55..58).contains(&v))));
+    for beam in [RelitBeam::AsLit, RelitBeam::Ideal] {
+        let sums = LightSums::Relit { weights: lit.view(), beam };
+        let bounds = |rows: Range<usize>| {
+            let (t, exists) = (s![.., rows.clone(), ..], s![.., rows.clone()]);
+            let part = Transport::measured(
+                estimate.t.slice(t).to_owned(),
+                estimate.u_min,
+                estimate.exists.slice(exists).to_owned(),
+            );
+            let samples = Samples { stack: stack.slice(t), valid: None, variance_ratio: None, u0_rows: None };
+            let bounds = model.prior_bias_in_rows(rows.start, &part, &samples, &sums, &family).unwrap();
+            bounds.index_axis_move(Axis(0), 0)
+        };
+        let whole = bounds(0..4);
+        assert!(whole.iter().all(|&bound| bound > 0.0), "{beam:?}: {whole:.4}");
+        for t in 0..4 {
+            assert_eq!(bounds(t..t + 1).row(0), whole.row(t));
+        }
+    }
+}

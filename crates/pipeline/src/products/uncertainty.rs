@@ -12,6 +12,8 @@ use super::relight::Relight;
 use crate::product::Product;
 use crate::stack::SweepStack;
 
+const NO_NOISE: &str = "the stack's noise could not be fitted; the report says why";
+
 /// The light whose trust is told: that of a band, or of an image under some rows.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum LightOf {
@@ -52,7 +54,7 @@ impl LightOf {
         transport: &Transport,
         mask: Array2<u8>,
     ) -> Result<Product, String> {
-        let noise = stack.noise.ok_or("the stack's noise could not be fitted; the report says why")?;
+        let noise = stack.noise.ok_or(NO_NOISE)?;
         let (says, image) = self.image(stack, noise, |model, samples, sums| {
             model.of_sums_in_rows(first_row, transport, samples, sums)
         })?;
@@ -76,7 +78,7 @@ impl LightOf {
         mask: Array2<u8>,
         family: &mut Option<BiasOfFamily>,
     ) -> Result<Product, String> {
-        let noise = stack.noise.unwrap_or(NoiseModel { read_variance: 0.0, gain: 0.0 });
+        let noise = stack.noise.ok_or(NO_NOISE)?;
         let (says, image) = self.image(stack, noise, |model, samples, sums| {
             let family = match family {
                 Some(family) => family,
@@ -84,7 +86,7 @@ impl LightOf {
             };
             model.prior_bias_in_rows(first_row, transport, samples, sums, family)
         })?;
-        let about = format!("bound on the bias that the prior gives to {says}, for 95 % of the pixels");
+        let about = format!("bound on the bias that the prior gives to {says}, meant for 95 % of the pixels");
         Ok(Product::Image { name, about, image, mask })
     }
 

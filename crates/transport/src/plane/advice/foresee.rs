@@ -179,7 +179,7 @@ impl Conditions<'_> {
     /// # Errors
     /// Those of [`reach`]; [`PlaneError::NotConvex`].
     pub fn foresee(&self, settings: &[Setting], noise: &Noise) -> Result<PredictedError, PlaneError> {
-        let pixels = Pixels::new(self.timing, &self.prior, settings)?;
+        let pixels = Pixels::new(self.timing, &self.prior, settings, self.timing.camera_rows() / 2)?;
         let light = pixels.light(settings, self.timing);
         let whole = pixels.solve_all(&light, None);
         let free = whole.mapv(|light| light > 0.0);
@@ -239,8 +239,13 @@ pub(super) struct Pixels {
 }
 
 impl Pixels {
-    pub fn new(timing: &RowTiming, prior: &Prior, settings: &[Setting]) -> Result<Self, PlaneError> {
-        let camera_row = timing.camera_rows() / 2;
+    /// The family as seen by the pixels of a camera row.
+    pub fn new(
+        timing: &RowTiming,
+        prior: &Prior,
+        settings: &[Setting],
+        camera_row: usize,
+    ) -> Result<Self, PlaneError> {
         let RowModel { slots, weights } =
             RowModel::typical(timing, settings, &reach(timing, settings)?, camera_row);
         let quadratic = Quadratic::new(weights.view(), &slots, prior)?;

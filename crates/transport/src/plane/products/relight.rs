@@ -1,3 +1,4 @@
+use std::ops::Range;
 use std::sync::Arc;
 
 use ndarray::{Array1, Array2, ArrayView1, ArrayView2, ArrayViewMut1, Axis};
@@ -75,16 +76,23 @@ pub(super) struct LitRows<'a> {
 }
 
 /// Pixels of a camera row that look at the same projector row with the same response.
+#[derive(Clone)]
 pub(super) struct LitClass {
     /// Ascending.
     pub columns: Vec<usize>,
-    own_row: i64,
+    /// The projector row that they look at.
+    pub own_row: i64,
     /// By which the weights are spread; `None` if they are as they are to be used.
     shares: Option<Shares>,
     weights: Arc<Array1<f64>>,
 }
 
 impl LitClass {
+    /// The same for pixels that look at another row.
+    pub fn at(&self, own_row: i64) -> Self {
+        Self { own_row, ..self.clone() }
+    }
+
     /// What the light of relative row `u` counts for.
     pub fn weight(&self, u: i32) -> f64 {
         let v = self.own_row + i64::from(u);
@@ -128,14 +136,23 @@ impl<'a> LitRows<'a> {
         Ok(Self { timing, columns, weights: Arc::new(weights), beam })
     }
 
+    /// The class of the pixel in the middle of the image.
+    pub fn typical(&self) -> LitClass {
+        self.classes_of(self.timing.camera_rows() / 2, self.columns / 2..self.columns / 2 + 1).swap_remove(0)
+    }
+
     /// The classes of camera row `t`.
     pub fn classes(&self, t: usize) -> Vec<LitClass> {
+        self.classes_of(t, 0..self.columns)
+    }
+
+    fn classes_of(&self, t: usize, columns: Range<usize>) -> Vec<LitClass> {
         let weights = || self.weights.clone();
         let Some(response) = self.timing.response() else {
-            let (columns, own_row) = ((0..self.columns).collect(), self.timing.camera().own_row(t) as i64);
+            let (columns, own_row) = (columns.collect(), self.timing.camera().own_row(t) as i64);
             return vec![LitClass { columns, own_row, shares: None, weights: weights() }];
         };
-        let classes = response.classes(t, 0..self.columns, PLACE_STEPS).into_iter();
+        let classes = response.classes(t, columns, PLACE_STEPS).into_iter();
         classes
             .map(|class| LitClass {
                 columns: class.columns,

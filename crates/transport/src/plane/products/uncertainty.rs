@@ -1,3 +1,4 @@
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::{Range, RangeInclusive};
 
 use ndarray::{
@@ -129,14 +130,15 @@ impl Uncertainty<'_> {
         })
     }
 
-    /// The family of [`super::super::advice`], photographed with these settings and this noise in the middle of the image,
-    /// and solved, for [`Self::prior_bias_in_rows`].
+    /// The family of [`super::super::advice`], photographed with these settings and this noise, and solved,
+    /// for [`Self::prior_bias_in_rows`].
     ///
     /// # Errors
     /// Those of [`Self::of_bands`].
     pub fn bias_of_family(&self) -> Result<BiasOfFamily, PlaneError> {
         self.timing.check(self.settings)?;
         self.prior.check()?;
+        self.noise.check()?;
         let mean = |frames: &mut dyn ExactSizeIterator<Item = usize>| {
             let count = frames.len().max(1) as f64;
             (frames.sum::<usize>() as f64 / count).round().max(1.0) as u32
@@ -155,7 +157,8 @@ impl Uncertainty<'_> {
     /// itself shows, and of the pixel's whole light.
     ///
     /// The estimate does not show how rough the truth is, so the multiples are taken from transports that are known,
-    /// those of `family`. The bound holds for 98 % of them, so that it holds for 95 % of the pixels of other scenes.
+    /// those of `family`, which is that of the same model. The bound holds for 98 % of them and is meant for 95 % of the
+    /// pixels of other scenes.
     ///
     /// # Errors
     /// Those of [`Self::of_sums_in_rows`].
@@ -169,18 +172,19 @@ impl Uncertainty<'_> {
     ) -> Result<Array3<f32>, PlaneError> {
         self.check(first_row, transport, samples)?;
         let (_, rows, columns) = transport.t.dim();
-        let of_rows = Sums::new(sums, self.timing, first_row..first_row + rows, columns)?;
-        let bounds = of_rows.bias_bounds(family, rows, columns)?;
+        let bounds =
+            Sums::new(sums, self.timing, first_row..first_row + rows, columns)?.bias_bounds(family)?;
         let prior = self.prior;
         self.for_each_tile(first_row, transport, samples, sums, &|problem, tile, rows, sums| {
             let solutions = problem.solutions(sums, transport.u_min, tile, rows)?;
-            let differences = prior.differences(&problem.model.slots);
+            let links = prior.links(&problem.model.slots);
             let estimates = problem.light(transport.u_min, tile, rows);
-            let sizes = bias_sizes(&prior, &differences, &solutions, &estimates, sums.len());
+            let sizes = bias_sizes(&prior, &links, &solutions, &estimates, sums.len());
             for (index, &(at, column)) in tile.pixels.iter().enumerate() {
                 let light = estimates.row(index).sum();
                 let Data { t, out, .. } = &mut rows[at].data;
-                let bounds = &bounds[*t];
+                let own_row = sums.class(*t, column).map(|class| class.own_row);
+                let bounds = bounds.get(&own_row).map_or(&[][..], Vec::as_slice);
                 for (sum, (out, bound)) in out.column_mut(column).into_iter().zip(bounds).enumerate() {
                     let size = sizes[index * sums.len() + sum];
                     *out = (bound.of_size * size + bound.of_light * light) as f32;
@@ -303,8 +307,13 @@ pub enum LightSums<'a> {
 enum Sums<'a> {
     /// Over relative rows, each with weight 1.
     Bands(&'a [Vec<RangeInclusive<i32>>]),
-    /// One, over all rows: the light under some of the projector's. Classes by camera row, from the first one.
-    Relit(Vec<Vec<LitClass>>),
+    /// One, over all rows: the light under some of the projector's.
+    Relit {
+        /// Classes by camera row, from the first one.
+        rows: Vec<Vec<LitClass>>,
+        /// That of a pixel in the middle of the image, whichever rows these are.
+        typical: LitClass,
+    },
 }
 
 impl<'a> Sums<'a> {
@@ -318,7 +327,8 @@ impl<'a> Sums<'a> {
             LightSums::Bands(bands) => Self::Bands(bands),
             LightSums::Relit { weights, beam } => {
                 let lit = LitRows::new(timing, columns, weights, beam)?;
-                Self::Relit(camera_rows.map(|t| lit.classes(t)).collect())
+                let rows = camera_rows.map(|t| lit.classes(t)).collect();
+                Self::Relit { rows, typical: lit.typical() }
             }
         })
     }
@@ -326,7 +336,7 @@ impl<'a> Sums<'a> {
     fn len(&self) -> usize {
         match self {
             Self::Bands(bands) => bands.len(),
-            Self::Relit(_) => 1,
+            Self::Relit { .. } => 1,
         }
     }
 
@@ -334,39 +344,30 @@ impl<'a> Sums<'a> {
     fn class(&self, t: usize, column: usize) -> Option<&LitClass> {
         match self {
             Self::Bands(_) => None,
-            Self::Relit(rows) => rows[t].iter().find(|class| class.columns.binary_search(&column).is_ok()),
+            Self::Relit { rows, .. } => {
+                rows[t].iter().find(|class| class.columns.binary_search(&column).is_ok())
+            }
         }
     }
 
-    /// The bounds of each sum in each camera row, `[rows][sums]`. Under other light, it is the largest of those of the row's
-    /// first, middle and last pixel.
+    /// The bounds of each sum by the projector row that pixels look at; `None` if the weights do not depend on it.
     fn bias_bounds(
         &self,
         family: &BiasOfFamily,
-        rows: usize,
-        columns: usize,
-    ) -> Result<Vec<Vec<BiasBound>>, PlaneError> {
-        let of_class =
-            |index: usize, class: Option<&LitClass>| family.bound(|u| self.weight(index, class, u));
+    ) -> Result<BTreeMap<Option<i64>, Vec<BiasBound>>, PlaneError> {
         match self {
             Self::Bands(bands) => {
-                let bounds = (0..bands.len()).map(|index| of_class(index, None)).collect::<Result<_, _>>()?;
-                Ok(vec![bounds; rows])
+                let bounds = (0..bands.len()).map(|index| family.bound(|u| self.weight(index, None, u)));
+                Ok(BTreeMap::from([(None, bounds.collect::<Result<_, _>>()?)]))
             }
-            Self::Relit(_) => (0..rows)
-                .into_par_iter()
-                .map(|t| {
-                    let mut classes: Vec<&LitClass> = Vec::new();
-                    for class in [0, columns / 2, columns - 1].iter().filter_map(|&s| self.class(t, s)) {
-                        if !classes.iter().any(|other| std::ptr::eq(*other, class)) {
-                            classes.push(class);
-                        }
-                    }
-                    let bounds = classes.into_iter().map(|class| of_class(0, Some(class)));
-                    let largest = bounds.reduce(|a, b| Ok(a?.or_larger(b?)));
-                    largest.unwrap_or(Ok(BiasBound::NONE)).map(|bound| vec![bound])
-                })
-                .collect(),
+            Self::Relit { rows, typical } => {
+                let own_rows: BTreeSet<i64> = rows.iter().flatten().map(|class| class.own_row).collect();
+                let of_row = |own_row| {
+                    let class = typical.at(own_row);
+                    family.bound(|u| class.weight(u)).map(|bound| (Some(own_row), vec![bound]))
+                };
+                own_rows.into_par_iter().map(of_row).collect()
+            }
         }
     }
 
@@ -374,7 +375,7 @@ impl<'a> Sums<'a> {
     fn weight(&self, index: usize, class: Option<&LitClass>, u: i32) -> f64 {
         match self {
             Self::Bands(bands) => f64::from(u8::from(bands[index].iter().any(|range| range.contains(&u)))),
-            Self::Relit(_) => class.map_or(0.0, |class| class.weight(u)),
+            Self::Relit { .. } => class.map_or(0.0, |class| class.weight(u)),
         }
     }
 }

@@ -82,7 +82,7 @@ impl Prior {
     }
 
     /// The entries of each row of [`Self::differences`] other than 0, each with its slot.
-    pub(super) fn links(&self, slots: &[Slot]) -> Vec<[(usize, f64); 2]> {
+    pub(in super::super) fn links(&self, slots: &[Slot]) -> Vec<[(usize, f64); 2]> {
         let mut links = Vec::with_capacity(slots.len());
         for (lower, &slot) in slots.iter().enumerate() {
             let (step_rows, weight) = match self {
