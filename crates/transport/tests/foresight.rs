@@ -226,7 +226,8 @@ fn searched_plans_are_as_good_on_scenes_that_the_search_does_not_know() {
 /// The bound on the prior's bias against the biases of scenes that are not in the family.
 #[test]
 fn biases_lie_within_their_bound() {
-    const RUNS: u64 = 6;
+    // So many that what is left of the noise is small beside the narrowest bounds.
+    const RUNS: u64 = 24;
     const NAMES: [&str; 5] = ["paper 75x8", "60+15 x8", "film new", "even 15", "quick"];
     const BANDS: [RangeInclusive<i32>; 4] = [0..=0, 3..=3, 1..=10, 11..=40];
     let bands = BANDS.map(|rows| vec![-rows.end()..=-rows.start(), rows]);
@@ -253,9 +254,9 @@ fn biases_lie_within_their_bound() {
         };
         let family = model.bias_of_family().unwrap();
         // The sums of the light of a pixel in camera row `t`.
-        let sums = |profile: ArrayView1<f32>, t: usize| -> Vec<f64> {
+        let sums = |light: &dyn Fn(usize, i32) -> f64, t: usize| -> Vec<f64> {
             let sum = |weight: &dyn Fn(i32) -> f64| {
-                demux.reach().zip(profile).map(|(u, &light)| weight(u) * f64::from(light)).sum()
+                demux.reach().enumerate().map(|(index, u)| weight(u) * light(index, u)).sum()
             };
             let lit_row = |weights: &Array1<f64>, u: i32| {
                 let row = t.checked_add_signed(u as isize).and_then(|row| weights.get(row));
@@ -272,7 +273,8 @@ fn biases_lie_within_their_bound() {
                 (1..=RUNS).map(|seed| photographed_in(plan.frames as usize, &ideal, seed)).collect();
             let solved = |stack: &Array3<f32>| demux.solve_rows(&rows, stack.view(), None, &|| true).unwrap();
             let estimates: Vec<Transport> = stacks.iter().map(solved).collect();
-            let mean = estimates.iter().fold(Array3::zeros(estimates[0].t.dim()), |sum, of| sum + &of.t);
+            let mean =
+                estimates.iter().fold(Array3::<f32>::zeros(estimates[0].t.dim()), |sum, of| sum + &of.t);
             let (mean, truth) = (mean / RUNS as f32, truth(scene, demux.reach()));
             for (at, &t) in rows.iter().enumerate() {
                 let one = s![.., at..at + 1, ..];
@@ -291,13 +293,14 @@ fn biases_lie_within_their_bound() {
                     .map(|bound| bound.to_owned())
                     .chain(lit.iter().map(relit))
                     .collect();
+                let visible = sums(&|_, u| f64::from(u8::from((0..128).contains(&(t as i32 + u)))), t);
                 for column in 0..scene.dim().2 {
-                    let found = sums(mean.slice(s![.., at, column]), t);
-                    let truths = sums(truth.slice(s![.., at, column]), t);
+                    let found = sums(&|index, _| f64::from(mean[[index, at, column]]), t);
+                    let truths = sums(&|index, _| f64::from(truth[[index, at, column]]), t);
                     for (sum, bound) in bounds.iter().enumerate() {
                         let bound = f64::from(bound[[0, column]]);
-                        // A pixel none of whose rows within the reach is in the sum tells nothing.
-                        if truths[sum] == 0.0 {
+                        // A pixel that sees none of the rows of the sum tells nothing.
+                        if visible[sum] == 0.0 {
                             continue;
                         }
                         within[sum].push(f64::from(u8::from((found[sum] - truths[sum]).abs() <= bound)));
@@ -312,7 +315,7 @@ fn biases_lie_within_their_bound() {
         println!("{:12} within {shares:.3?}, median bound over light {widths:.3?}", plan.name);
         assert!(shares.iter().all(|&share| share >= 0.93), "{shares:?}");
         // Wide bounds hold, too: those of direct light and of the stripes say something with every plan.
-        assert!(widths[0] < 0.6 && widths[5] < 0.4, "{widths:?}");
+        assert!(widths[0] < 0.8 && widths[5] < 0.4, "{widths:?}");
     }
 }
 

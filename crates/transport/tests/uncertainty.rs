@@ -514,8 +514,10 @@ fn the_bias_of_a_relit_image_is_bounded_at_every_pixel_of_a_tilted_rig() {
         calibration: None,
     };
     let family = model.bias_of_family().unwrap();
-    let lit = Array1::from_shape_fn(timing.projector_rows(), |v| f64::from(u8::from((55..58).contains(&v))));
-    for beam in [RelitBeam::AsLit, RelitBeam::Ideal] {
+    // Near the pixels' own rows, and at either end of the projector, which no camera row of the family sees.
+    let lightings = [55..58, 0..2, 126..128];
+    for (lit, beam) in lightings.iter().flat_map(|lit| [(lit, RelitBeam::AsLit), (lit, RelitBeam::Ideal)]) {
+        let lit = Array1::from_shape_fn(timing.projector_rows(), |v| f64::from(u8::from(lit.contains(&v))));
         let sums = LightSums::Relit { weights: lit.view(), beam };
         let bounds = |rows: Range<usize>| {
             let (t, exists) = (s![.., rows.clone(), ..], s![.., rows.clone()]);

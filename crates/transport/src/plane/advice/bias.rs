@@ -16,6 +16,7 @@ const WITHIN: f64 = 0.98;
 #[derive(Debug)]
 pub struct BiasOfFamily {
     prior: Prior,
+    projector_rows: i32,
     /// In the middle of the image, in its first and in its last camera row: a row sees other relative rows than others.
     solved: Vec<SolvedFamily>,
 }
@@ -28,9 +29,8 @@ struct SolvedFamily {
     rows: Vec<(usize, i32)>,
     links: Vec<[(usize, f64); 2]>,
     quadratic: Quadratic,
-    /// One estimate, and the slots that are free in it.
-    estimate: Array2<f64>,
-    free: Array2<bool>,
+    /// An estimate for each noise pattern, and the slots that are free in it.
+    estimates: Vec<(Array2<f64>, Array2<bool>)>,
     /// What estimates are off on average.
     off: Array2<f64>,
 }
@@ -56,25 +56,25 @@ impl BiasOfFamily {
         let solve = |camera_row| SolvedFamily::new(timing, prior, settings, noise, camera_row);
         let solved =
             [timing.camera_rows() / 2, 0, last].into_par_iter().map(solve).collect::<Result<_, _>>()?;
-        Ok(Self { prior, solved })
+        Ok(Self { prior, projector_rows: timing.projector_rows() as i32, solved })
     }
 
     /// The bound on a sum in which the light of relative row `u` has the weight `weight(u)`, not negative: that of the
-    /// camera row which sees the most of the sum.
+    /// camera row which sees the most of the sum. Where none sees any of it, the sum is taken for one of the farthest
+    /// rows that are seen.
     pub(in super::super) fn bound(&self, weight: impl Fn(i32) -> f64) -> Result<BiasBound, PlaneError> {
-        let seen = |solved: &SolvedFamily| solved.rows.iter().map(|&(_, u)| weight(u)).sum::<f64>();
-        let mut best: Option<(f64, &SolvedFamily)> = None;
-        for solved in &self.solved {
-            let seen = seen(solved);
-            if best.is_none_or(|(most, _)| seen > most) {
-                best = Some((seen, solved));
-            }
+        let all: f64 = (-self.projector_rows..=self.projector_rows).map(&weight).sum();
+        let total = |solved: &SolvedFamily| solved.weights(&weight).sum();
+        let best =
+            self.solved.iter().max_by(|a, b| total(a).total_cmp(&total(b))).ok_or(PlaneError::NotConvex)?;
+        if total(best) > 0.0 {
+            return best.bound(&self.prior, best.weights(&weight));
         }
-        match best {
-            Some((seen, solved)) if seen > 0.0 => solved.bound(&self.prior, weight),
-            // Nothing that any pixel could see is in the sum.
-            _ => Ok(BiasBound { of_size: 0.0, of_light: 0.0 }),
-        }
+        let farthest = self.solved.iter().flat_map(|solved| {
+            [solved.rows.first(), solved.rows.last()].into_iter().flatten().map(move |row| (solved, row.1))
+        });
+        let (solved, farthest) = farthest.max_by_key(|(_, u)| u.abs()).ok_or(PlaneError::NotConvex)?;
+        solved.bound(&self.prior, solved.weights(|u| if u == farthest { all } else { 0.0 }))
     }
 }
 
@@ -88,43 +88,57 @@ impl SolvedFamily {
     ) -> Result<Self, PlaneError> {
         let pixels = Pixels::new(timing, &prior, settings, camera_row)?;
         let light = pixels.light(settings, timing);
-        let mut estimate = pixels.solve_all(&noise.added(settings, &light, 0), None);
-        let near = estimate.mapv(|light| light > 0.0);
-        let mut mean = estimate.clone();
-        for draw in 1..DRAWS {
-            mean += &pixels.solve_all(&noise.added(settings, &light, draw), Some(&near));
+        let mut estimates: Vec<Array2<f64>> = Vec::new();
+        for draw in 0..DRAWS {
+            let near = estimates.first().map(|estimate| estimate.mapv(|light| light > 0.0));
+            estimates.push(pixels.solve_all(&noise.added(settings, &light, draw), near.as_ref()));
         }
-        mean /= DRAWS as f64;
+        let zeros = Array2::zeros((light.nrows(), pixels.slots.len()));
+        let mean = estimates.iter().fold(zeros, |sum, estimate| sum + estimate) / DRAWS as f64;
         let Pixels { slots, quadratic, own_slots, truth, .. } = pixels;
-        let mut off = Array2::zeros(estimate.dim());
+        let mut off = Array2::zeros(mean.dim());
         for (of_truth, &slot) in truth.axis_iter(Axis(1)).zip(&own_slots) {
             off.column_mut(slot).assign(&(&mean.column(slot) - &of_truth));
         }
-        let mut free = near;
-        for (slot, _) in slots.iter().enumerate().filter(|(_, slot)| slot.kind != SlotKind::Own) {
-            estimate.column_mut(slot).fill(0.0);
-            free.column_mut(slot).fill(true);
-        }
+        let others = || slots.iter().enumerate().filter(|(_, slot)| slot.kind != SlotKind::Own);
+        let of_profiles = |mut estimate: Array2<f64>| {
+            let mut free = estimate.mapv(|light| light > 0.0);
+            for (slot, _) in others() {
+                estimate.column_mut(slot).fill(0.0);
+                free.column_mut(slot).fill(true);
+            }
+            (estimate, free)
+        };
+        let estimates = estimates.into_iter().map(of_profiles).collect();
         let rows = own_slots.iter().map(|&slot| (slot, slots[slot].u)).collect();
-        Ok(Self { rows, links: prior.links(&slots), quadratic, estimate, free, off })
+        Ok(Self { rows, links: prior.links(&slots), quadratic, estimates, off })
     }
 
-    fn bound(&self, prior: &Prior, weight: impl Fn(i32) -> f64) -> Result<BiasBound, PlaneError> {
-        let (pixels, slots) = self.estimate.dim();
-        let mut weights = Array1::zeros(slots);
+    /// The weight of each slot.
+    fn weights(&self, weight: impl Fn(i32) -> f64) -> Array1<f64> {
+        let mut weights = Array1::zeros(self.off.ncols());
         self.rows.iter().for_each(|&(slot, u)| weights[slot] = weight(u));
-        let linear = weights.broadcast((pixels, slots)).ok_or(PlaneError::NotConvex)?.to_owned();
-        let solutions = minimise_free(SimdLevel::best(), &self.quadratic, linear, self.free.view());
-        if !solutions.iter().all(|entry| entry.is_finite()) {
-            return Err(PlaneError::NotConvex);
-        }
-        let sizes = bias_sizes(prior, &self.links, &solutions, &self.estimate, 1);
-        let light = self.estimate.sum_axis(Axis(1));
-        // Both parts count alike on average; where smoothing leaves nothing to be seen, the light alone counts.
-        let mean_size = sizes.sum();
-        let light_share = if mean_size > 0.0 { mean_size / light.sum().max(f64::MIN_POSITIVE) } else { 1.0 };
+        weights
+    }
+
+    fn bound(&self, prior: &Prior, weights: Array1<f64>) -> Result<BiasBound, PlaneError> {
         let bias = self.off.dot(&weights).mapv(f64::abs);
-        let ratios = bias.iter().zip(&sizes).zip(&light).filter_map(|((bias, size), light)| {
+        // What each estimate of a pixel shows: the size of its bias, and its light.
+        let mut shown: Vec<[f64; 2]> = Vec::new();
+        for (estimate, free) in &self.estimates {
+            let linear = weights.broadcast(estimate.dim()).ok_or(PlaneError::NotConvex)?.to_owned();
+            let solutions = minimise_free(SimdLevel::best(), &self.quadratic, linear, free.view());
+            if !solutions.iter().all(|entry| entry.is_finite()) {
+                return Err(PlaneError::NotConvex);
+            }
+            let sizes = bias_sizes(prior, &self.links, &solutions, estimate, 1);
+            shown
+                .extend(sizes.into_iter().zip(estimate.sum_axis(Axis(1))).map(|(size, light)| [size, light]));
+        }
+        // Both parts count alike on average; where smoothing leaves nothing to be seen, the light alone counts.
+        let [sizes, light] = shown.iter().fold([0.0; 2], |sum, of| [sum[0] + of[0], sum[1] + of[1]]);
+        let light_share = if sizes > 0.0 { sizes / light.max(f64::MIN_POSITIVE) } else { 1.0 };
+        let ratios = shown.iter().zip(bias.iter().cycle()).filter_map(|([size, light], bias)| {
             let scale = size + light_share * light;
             (scale > 0.0).then(|| bias / scale)
         });

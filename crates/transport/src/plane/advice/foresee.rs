@@ -36,7 +36,7 @@ impl Noise {
     pub(super) fn added(&self, settings: &[Setting], light: &Array2<f64>, draw: u64) -> Array2<f64> {
         let mut noisy = light.clone();
         for (pixel, mut samples) in noisy.rows_mut().into_iter().enumerate() {
-            let mut random = Random::new(DRAWS * pixel as u64 + draw);
+            let mut random = Random::new(draw << 32 | pixel as u64);
             let mut darks: Vec<(f64, f64)> = Vec::new();
             for (sample, setting) in samples.iter_mut().zip(settings) {
                 let dark = match darks.iter().find(|(exposure_us, _)| *exposure_us == setting.exposure_us) {
