@@ -211,7 +211,11 @@ def check_film(faults, session, header, entries):
     faults.equal(transport.shape, (shape["points"], depth, *frame), "shape of the film's transport")
     faults.equal(transport.dtype, np.dtype("float32"), "type of the film's transport")
     faults.equal(transport.metadata.dimension_names, ("cycle", "u", "t", "s"), "axes of the film's transport")
-    for name, array in (("film", film), ("transport", transport)):
+    mask = zarr.open_group(session / "transport_film.zarr", mode="r", zarr_format=3)["mask"]
+    faults.equal(mask.shape, transport.shape, "shape of the film's masks")
+    faults.equal(mask.dtype, np.dtype("uint8"), "type of the film's masks")
+    faults.equal(mask.metadata.dimension_names, ("cycle", "u", "t", "s"), "axes of the film's masks")
+    for name, array in (("film", film), ("transport", transport), ("mask", mask)):
         faults.equal(array.shards[0], 1, f"cycles in a shard of {name}")
     cycles = {entry["cycle"]: entry for entry in entries if entry["event"] == "cycle"}
     faults.check(cycles, "no cycle is stored")

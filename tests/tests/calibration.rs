@@ -152,7 +152,7 @@ fn a_strip_of_the_board_cancels_jitter_that_no_device_measures() {
         let rig = Rig::load(&bench.folder.path().join("rig.toml")).unwrap();
         let transports = TransportFilm::open(&ended.session.join("transport_film.zarr")).unwrap();
         let u_min = transports.attributes()["u_min"].as_i64().unwrap() as i32;
-        let found = transports.read(5).unwrap().unwrap();
+        let found = transports.read(5).unwrap().unwrap().t;
         let scene = rig.simulated().unwrap().scene().transport.index_axis(Axis(3), 0).to_owned();
         let found = found.slice(s![(-80 - u_min) as usize..=(80 - u_min) as usize, .., ..]);
         median_profile_error(found, relative_rows(scene.view(), &(-80..=80)).view())

@@ -162,7 +162,7 @@ fn the_transport_of_a_cycle_is_the_scenes_at_that_time() {
         norm(&(a - b)) / norm(b)
     };
     for cycle in state.cycles() {
-        let transport = transports.read(cycle.cycle).unwrap().unwrap();
+        let transport = transports.read(cycle.cycle).unwrap().unwrap().t;
         let epipolar = transport.slice(s![-u_min as usize, .., ..]).to_owned();
         let middle_ns = start_ns + ((cycle.start_s + 0.12) * 1e9) as i64;
         let own = distance(&epipolar, &direct_at(middle_ns));
@@ -308,7 +308,7 @@ fn the_views_of_a_film_are_in_the_live_file() {
     runner.run(RunParams { plan: plan(3), ..RunParams::default() }).unwrap();
     let ended = end_of(&mut events);
     let (session, _) = ended.open();
-    let last = TransportFilm::open(&session.transport_film_path()).unwrap().read(2).unwrap().unwrap();
+    let last = TransportFilm::open(&session.transport_film_path()).unwrap().read(2).unwrap().unwrap().t;
     let reader = LiveReader::open(&path).unwrap();
     let shown = |name: &str| reader.newest(name).unwrap().unwrap();
     let indirect = shown(INDIRECT);
@@ -485,7 +485,7 @@ fn frames_that_a_flying_spot_cuts_are_left_out_or_modelled() {
         let scene = rig.simulated().unwrap().scene().transport.index_axis(Axis(3), 0).to_owned();
         // Before and after the film has learned from its first cycles.
         let errors = [1, 5].map(|cycle| {
-            let found = film.read(cycle).unwrap().unwrap();
+            let found = film.read(cycle).unwrap().unwrap().t;
             let rows = u_min..=u_min + found.len_of(Axis(0)) as i32 - 1;
             median_profile_error(found.view(), relative_rows(scene.view(), &rows).view())
         });

@@ -5,8 +5,9 @@
 use std::path::Path;
 use std::process::Command;
 
-use ndarray::{Array3, Axis};
+use ndarray::{Array3, Axis, Zip, s};
 use raysweep::control::Control;
+use raysweep_pipeline::mask;
 use raysweep_processing::{Asked, ProcessError, process_asked};
 use raysweep_session::film::TransportFilm;
 use raysweep_session::{Session, manifest};
@@ -85,7 +86,7 @@ fn each_image_is_the_sum_of_its_cycles_transport_over_the_rows_that_it_names() {
         assert_eq!(images.dim(), (stored.len(), ROWS, COLUMNS));
         let (mut most, mut light) = (0.0_f64, 0.0_f64);
         for (image, &cycle) in images.outer_iter().zip(&stored) {
-            let transport = film.read(cycle).unwrap().unwrap();
+            let transport = film.read(cycle).unwrap().unwrap().t;
             for ((t, s), &value) in image.indexed_iter() {
                 let own = first_row + t as i64;
                 let profile = (0_i64..).zip(transport.index_axis(Axis(1), t).column(s).to_vec());
@@ -163,10 +164,9 @@ fn what_a_film_cannot_show_is_refused_before_anything_moves() {
         assert!(field.starts_with("product.0."), "{field}");
     }
     let ended = complete(&bench, &plan(2));
-    for (product, part) in [
-        (r#"kind = "uncertainty", from_rows = 0"#, "a film's products are"),
-        (r#"kind = "band", from_rows = 5000"#, "beyond"),
-    ] {
+    for (product, part) in
+        [(r#"kind = "regular""#, "a film's products are"), (r#"kind = "band", from_rows = 5000"#, "beyond")]
+    {
         let asked = Asked { products: vec![product.into()], ..Asked::default() };
         match process_asked(&ended.session, &asked) {
             Err(ProcessError::Product(error)) => assert!(error.contains(part), "{product}: {error}"),
@@ -174,4 +174,69 @@ fn what_a_film_cannot_show_is_refused_before_anything_moves() {
         }
     }
     assert!(made(&ended).is_empty());
+}
+
+/// Of a scene that does not move, cycles differ by what the product `uncertainty` states.
+#[test]
+fn cycles_scatter_as_their_uncertainty_says() {
+    let sim = "scene = \"v-groove\"\nscene_rows = 64\nscene_columns = 48\nseed = 3";
+    let bench = Bench::new(&rig_text(720, sim, ""));
+    let products = [
+        r#"kind = "band", from_rows = 0, to_rows = 0, name = "direct""#,
+        r#"kind = "uncertainty", from_rows = 0, to_rows = 0, name = "direct-sd""#,
+        r#"kind = "prior-bias", from_rows = 0, to_rows = 0, name = "direct-bias""#,
+        r#"kind = "relight", stripes = { period_rows = 16, lit_rows = 6 }, name = "striped""#,
+        r#"kind = "uncertainty", stripes = { period_rows = 16, lit_rows = 6 }, name = "striped-sd""#,
+    ];
+    let ended = complete(&bench, &with_products(&products, &plan(40)));
+    assert!(video(&ended.session, "direct-bias").iter().all(|bound| bound.is_finite() && *bound >= 0.0));
+    for name in ["direct", "striped"] {
+        let [light, sd] = ["", "-sd"].map(|end| video(&ended.session, &format!("{name}{end}")));
+
+        // Those from which the film learns are solved by another model.
+        let (light, sd) = (light.slice(s![4.., .., ..]), sd.slice(s![4.., .., ..]));
+        let mean = light.mean_axis(Axis(0)).unwrap();
+        let nearer = (1.0 - 1.0 / light.len_of(Axis(0)) as f32).sqrt();
+        let within = light.outer_iter().zip(sd.outer_iter()).map(|(light, sd)| {
+            Zip::from(light)
+                .and(sd)
+                .and(&mean)
+                .fold(0, |sum, light, sd, mean| sum + usize::from((light - mean).abs() < sd * nearer))
+        });
+        let share = within.sum::<usize>() as f64 / light.len() as f64;
+        println!("{name}: {share:.3} within one standard deviation");
+        assert!((0.6..0.76).contains(&share), "{name}: {share}");
+    }
+}
+
+/// Where direct light saturates, a film says that it is a bound, in the transport and in each product that contains it.
+#[test]
+fn what_saturates_is_marked_in_each_cycle() {
+    let sim = format!("scene = \"mix\"\nscene_rows = {ROWS}\nscene_columns = {COLUMNS}\nseed = 3");
+    // Counts end below what the brightest pixels send.
+    let bench = Bench::new(&rig_text(720, &sim, "[sim.truth]\nwhite_dn = 7000\n"));
+    let products = [r#"kind = "epipolar""#, r#"kind = "band", from_rows = 5, to_rows = 9, name = "beside""#];
+    let ended = complete(&bench, &with_products(&products, &plan(6)));
+    let (session, _) = ended.open();
+    let film = TransportFilm::open(&session.transport_film_path()).unwrap();
+    let u_min = film.attributes()["u_min"].as_i64().unwrap();
+    let mask = |name: &str| -> Array3<u8> {
+        ndarray_npy::read_npy(ended.session.join(format!("products/{name}_mask.npy"))).unwrap()
+    };
+    let (epipolar, beside) = (mask("epipolar"), mask("beside"));
+    let bounds = epipolar.iter().filter(|bits| **bits & mask::BOUND_ONLY != 0).count();
+    assert!((1..epipolar.len()).contains(&bounds), "{bounds} of {}", epipolar.len());
+    for (cycle, (epipolar, beside)) in epipolar.outer_iter().zip(beside.outer_iter()).enumerate() {
+        let stored = film.read(cycle).unwrap().unwrap().mask;
+        for ((t, s), bits) in epipolar.indexed_iter() {
+            let is_bound = |u: i64| stored[[(u - u_min) as usize, t, s]] & mask::BOUND_ONLY != 0;
+            assert_eq!(bits & mask::BOUND_ONLY != 0, is_bound(0), "cycle {cycle}, pixel {t}, {s}");
+            let any = (-9..=9).any(|u: i64| u.abs() >= 5 && is_bound(u));
+            assert_eq!(beside[[t, s]] & mask::BOUND_ONLY != 0, any);
+        }
+    }
+    let names = metadata(&ended.session, "epipolar")["mask"].clone();
+    assert_eq!(names["bound only"], mask::BOUND_ONLY);
+    let picture = std::fs::read(ended.session.join("products/epipolar/0000.exr")).unwrap();
+    assert!(picture.windows(5).any(|bytes| bytes == b"mask\0"), "the EXR file has the channel");
 }

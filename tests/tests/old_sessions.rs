@@ -56,7 +56,7 @@ fn a_film_is_processed_to_the_transports_that_it_had() {
     let session = copy("film", folder.path());
     let transports = |session: &Path| {
         let film = TransportFilm::open(&session.join("transport_film.zarr")).unwrap();
-        [0, 1].map(|cycle| film.read(cycle).unwrap().unwrap())
+        [0, 1].map(|cycle| film.read(cycle).unwrap().unwrap().t)
     };
     let before = transports(&session);
     let processed = raysweep_processing::process(&session).unwrap();

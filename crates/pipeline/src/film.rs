@@ -133,8 +133,10 @@ pub struct FilmSolver {
     dark_frames: usize,
     /// The film's first cycles; `None` after it has learned from them.
     first: Option<FirstCycles>,
-    /// What the plan says, and then what they showed.
-    choices: Choices,
+    /// What the plan says, by which those are solved.
+    planned: Choices,
+    /// What they showed.
+    learned: Option<Choices>,
     /// The strip of the board that shows each frame's jitter, if it is in view.
     strip: Option<StripGauge>,
 }
@@ -163,7 +165,8 @@ impl FilmSolver {
         let dark = schedule.points.iter().find(|point| matches!(point.role, PointRole::Dark(_)));
         Ok(Self {
             options,
-            choices: Choices::planned(demux.clone(), geometry),
+            planned: Choices::planned(demux.clone(), geometry),
+            learned: None,
             demux,
             geometry: geometry.clone(),
             scale: geometry.scale_of(&rows),
@@ -197,8 +200,33 @@ impl FilmSolver {
         go_on: &(dyn Fn() -> bool + Sync),
     ) -> Result<Transport, NotSolved> {
         let mut stack = self.stack(frames, dark);
-        self.choices.solve(0..self.geometry.height, 0, &mut stack, go_on).map_err(not_solved)
+        let choices = self.learned.as_ref().unwrap_or(&self.planned);
+        choices.solve(0..self.geometry.height, 0, &mut stack, go_on).map_err(not_solved)
     }
+
+    /// The stack from which the transport of a cycle was solved, for its products; the number of cycles solved before it
+    /// decides how. Of a solver that has learned: its noise, and whether near rows are one band, are also those of the
+    /// cycles from which it has learned.
+    ///
+    /// # Errors
+    /// As [`Self::solve`].
+    pub fn solved_stack(
+        &self,
+        cycles_before: usize,
+        frames: &[(Setting, Arc<Array2<f32>>)],
+        dark: &Array2<f32>,
+    ) -> Result<SweepStack, NotSolved> {
+        let learned = self.learned.as_ref();
+        let choices = learned.filter(|_| cycles_before >= FIRST_CYCLES).unwrap_or(&self.planned);
+        let mut stack = self.stack(frames, dark);
+        choices.prepare(&(0..self.geometry.height), 0, &mut stack, &|| true).map_err(not_solved)?;
+        stack.noise = learned.and_then(Choices::noise);
+        stack.one_band = learned.is_some_and(|learned| learned.findings.one_band);
+        Ok(stack)
+    }
+
+    /// Number of cycles from which it learns.
+    pub const FIRST_CYCLES: usize = FIRST_CYCLES;
 
     /// Takes the frames of another complete cycle, as for [`Self::solve`]. Once it has the first few, it chooses from
     /// their mean how to demultiplex the cycles after them, as a sweep does from its images, and returns what it found.
@@ -221,10 +249,7 @@ impl FilmSolver {
         mean.images /= first.cycles as f32;
         let rows = rows_to_choose_by(self.geometry.height);
         Some(match choose(&self.demux, &self.options, &self.geometry, &rows, mean.of_rows(&rows)) {
-            Ok(choices) => {
-                self.choices = choices;
-                Ok(&self.choices.findings)
-            }
+            Ok(choices) => Ok(&self.learned.insert(choices).findings),
             Err(error) => Err(not_solved(error)),
         })
     }

@@ -265,6 +265,11 @@ impl Choices {
         Ok(self)
     }
 
+    /// The noise of a single frame, if it could be fitted.
+    pub(crate) fn noise(&self) -> Option<NoiseModel> {
+        self.noise
+    }
+
     /// Number of additional rows that the stack must contain on either side of those solved, where the image has
     /// them.
     pub fn halo_rows(&self) -> usize {
@@ -283,6 +288,22 @@ impl Choices {
         stack: &mut SweepStack,
         go_on: &(dyn Fn() -> bool + Sync),
     ) -> Result<Transport, PlaneError> {
+        let (demux, coupled) = self.prepare(&rows, held_from, stack, go_on)?;
+        let images = coupled.as_ref().unwrap_or(&stack.images);
+        let valid = stack.valid.as_ref().map(|valid| valid.view());
+        let rows: Vec<usize> = rows.collect();
+        demux.solve_rows(&rows, images.view(), valid, go_on)
+    }
+
+    /// Makes of a stack that from which camera rows `rows` are solved, as [`Self::solve`] does, and returns what solves
+    /// it, and its images after coupling, if they are coupled.
+    pub(crate) fn prepare(
+        &self,
+        rows: &Range<usize>,
+        held_from: usize,
+        stack: &mut SweepStack,
+        go_on: &(dyn Fn() -> bool + Sync),
+    ) -> Result<(Demux, Option<Array3<f32>>), PlaneError> {
         let cut = SpotCut::of(&self.geometry, &stack.timing, &stack.settings)?;
         let kept = (0..stack.settings.len()).filter(|&n| cut.keeps(n));
         // Neighbours see a spot at other times, so images that depend on it are not coupled.
@@ -322,11 +343,8 @@ impl Choices {
         stack.calibration = self.calibration;
         stack.one_band = self.findings.one_band;
         stack.u0_rows = self.demux.u0_rows().map(|u0_rows| u0_rows.slice(s![rows.clone(), ..]).to_owned());
-        let images = coupled.as_ref().unwrap_or(&stack.images);
-        let valid = stack.valid.as_ref().map(|valid| valid.view());
-        let rows: Vec<usize> = rows.collect();
         let demux = cut.modelled_by(self.demux.with_settings(stack.settings.clone())?)?;
-        demux.solve_rows(&rows, images.view(), valid, go_on)
+        Ok((demux, coupled))
     }
 }
 

@@ -5,10 +5,11 @@
 //! | --- | --- | --- | --- |
 //! | `film.zarr/film` | uint16 | `[cycle, setting, t, s]` | raw frames in camera counts (DN), settings in the plan's order |
 //! | `transport_film.zarr/transport` | float32 | `[cycle, u, t, s]` | light transport of each cycle, as in [`crate::transport`] |
+//! | `transport_film.zarr/mask` | uint8 | `[cycle, u, t, s]` | what is known of each value, as in [`crate::transport`] |
 //!
-//! One shard is one cycle, so that a cycle costs one fsync of a file and one of a folder. A cycle without a
-//! line in the ledger is not stored, whatever `film` contains; in `transport`, a cycle that was not estimated
-//! is NaN.
+//! One shard is one cycle, so that a cycle costs one fsync of a file and one of a folder for each array. A cycle without
+//! a line in the ledger is not stored, whatever `film` contains; in `transport`, a cycle that was not estimated is NaN,
+//! and its mask is 0.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -36,8 +37,21 @@ pub struct CycleArray<T> {
 /// `film.zarr/film` `[cycle, setting, t, s]`.
 pub type Film = CycleArray<u16>;
 
-/// `transport_film.zarr/transport` `[cycle, u, t, s]`.
-pub type TransportFilm = CycleArray<f32>;
+/// `transport_film.zarr`: the transport of each cycle, and its mask.
+pub struct TransportFilm {
+    transport: CycleArray<f32>,
+    /// `None` in sessions of versions that wrote none.
+    mask: Option<CycleArray<u8>>,
+}
+
+/// The transport of a cycle, `[u, t, s]`, and what is known of each of its values.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CycleTransport {
+    /// Light.
+    pub t: Array3<f32>,
+    /// Bits; 0 if nothing is stored.
+    pub mask: Array3<u8>,
+}
 
 /// Layout of a cycle array in its group.
 struct Layout {
@@ -79,8 +93,9 @@ impl Film {
 }
 
 impl TransportFilm {
-    /// Creates an empty series of `cycles` transports `[u, t, s]` at `dir`, replacing any existing one.
-    /// `attributes` become those of the array: `u_min`, `row_time_us`, the prior and how it was computed.
+    /// Creates an empty series of `cycles` transports `[u, t, s]` at `dir`, replacing any existing one. `attributes`
+    /// become those of the array: `u_min`, `row_time_us`, the prior and how it was computed; `bits` names the bits of
+    /// the masks.
     ///
     /// # Errors
     /// [`Error::Zarr`] or [`Error::Io`] if the file system refuses.
@@ -89,11 +104,23 @@ impl TransportFilm {
         cycles: usize,
         cycle: [usize; 3],
         attributes: &Map<String, Value>,
+        bits: &Value,
     ) -> Result<Self> {
         if dir.exists() {
             std::fs::remove_dir_all(dir).map_err(Error::io("remove", dir))?;
         }
-        Self::create_array(dir, cycles, cycle, transport_layout(cycle[0]), attributes.clone())
+        let [depth, ..] = cycle;
+        let of_mask = Map::from_iter([("bits".to_owned(), bits.clone())]);
+        Ok(Self {
+            transport: CycleArray::create_array(
+                dir,
+                cycles,
+                cycle,
+                transport_layout(depth),
+                attributes.clone(),
+            )?,
+            mask: Some(CycleArray::create_array(dir, cycles, cycle, mask_layout(depth), of_mask)?),
+        })
     }
 
     /// Opens the series at `dir`.
@@ -101,12 +128,49 @@ impl TransportFilm {
     /// # Errors
     /// [`Error::Zarr`] if it is missing or damaged.
     pub fn open(dir: &Path) -> Result<Self> {
-        Self::open_array(dir, &transport_layout(1))
+        let transport = CycleArray::open_array(dir, &transport_layout(1))?;
+        let layout = mask_layout(1);
+        let has_mask = dir.join(layout.name).exists();
+        let mask = has_mask.then(|| CycleArray::open_array(dir, &layout)).transpose()?;
+        Ok(Self { transport, mask })
     }
 
     /// The attributes that it was created with.
     pub fn attributes(&self) -> &Map<String, Value> {
-        self.array.attributes()
+        self.transport.array.attributes()
+    }
+
+    /// Number of cycles that it can hold.
+    pub fn cycles(&self) -> usize {
+        self.transport.cycles()
+    }
+
+    /// Writes a cycle, replacing any existing one; when this returns, it is durable.
+    ///
+    /// # Errors
+    /// As [`CycleArray::write`].
+    pub fn write(&self, cycle: usize, transport: ArrayView3<f32>, mask: ArrayView3<u8>) -> Result<()> {
+        // The cycle is there when its transport is.
+        self.mask.as_ref().map_or(Ok(()), |masks| masks.write(cycle, mask))?;
+        self.transport.write(cycle, transport)
+    }
+
+    /// Reads a cycle; `None` if it was never written.
+    ///
+    /// # Errors
+    /// As [`CycleArray::read`].
+    pub fn read(&self, cycle: usize) -> Result<Option<CycleTransport>> {
+        let Some(t) = self.transport.read(cycle)? else { return Ok(None) };
+        let mask = self.mask.as_ref().map_or(Ok(None), |masks| masks.read(cycle))?;
+        Ok(Some(CycleTransport { mask: mask.unwrap_or_else(|| Array3::zeros(t.dim())), t }))
+    }
+
+    /// Whether a cycle was written, without decoding it.
+    ///
+    /// # Errors
+    /// As [`CycleArray::contains`].
+    pub fn contains(&self, cycle: usize) -> Result<bool> {
+        self.transport.contains(cycle)
     }
 }
 
@@ -119,6 +183,11 @@ fn transport_layout(depth: usize) -> Layout {
     let axes = ["cycle", "u", "t", "s"];
     let fill = f32::NAN.into();
     Layout { name: "transport", axes, chunk_depth: depth, data_type: data_type::float32(), fill }
+}
+
+fn mask_layout(depth: usize) -> Layout {
+    let axes = ["cycle", "u", "t", "s"];
+    Layout { name: "mask", axes, chunk_depth: depth, data_type: data_type::uint8(), fill: 0u8.into() }
 }
 
 impl<T: Element + ElementOwned + Clone + Default> CycleArray<T> {
@@ -302,13 +371,16 @@ mod tests {
         let path = dir.path().join("transport_film.zarr");
         let attributes = Map::from_iter([("u_min".to_owned(), Value::from(-3))]);
         let transport = Array3::from_shape_fn((7, 9, 70), |(u, t, s)| (u * 900 + t * 70 + s) as f32 / 7.0);
-        let film = TransportFilm::create(&path, 2, [7, 9, 70], &attributes).unwrap();
-        film.write(1, transport.view()).unwrap();
+        let mask = transport.mapv(|light| light as u8);
+        let bits = Value::from("bits");
+        let film = TransportFilm::create(&path, 2, [7, 9, 70], &attributes, &bits).unwrap();
+        film.write(1, transport.view(), mask.view()).unwrap();
         let opened = TransportFilm::open(&path).unwrap();
         assert_eq!((opened.cycles(), opened.attributes()), (2, &attributes));
-        assert_eq!(opened.read(1).unwrap(), Some(transport));
+        assert_eq!(opened.mask.as_ref().unwrap().array.attributes()["bits"], bits);
+        assert_eq!(opened.read(1).unwrap(), Some(CycleTransport { t: transport, mask }));
         assert_eq!(opened.read(0).unwrap(), None);
-        TransportFilm::create(&path, 2, [7, 9, 70], &attributes).unwrap();
+        TransportFilm::create(&path, 2, [7, 9, 70], &attributes, &bits).unwrap();
         assert_eq!(opened.read(1).unwrap(), None);
     }
 

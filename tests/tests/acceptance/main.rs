@@ -85,7 +85,7 @@ fn error_of_film(ended: &Ended, sim: &PlaneRig) -> f64 {
     let u_min = film.attributes()["u_min"].as_i64().unwrap();
     let mut errors: Vec<f64> = (4..8)
         .filter_map(|cycle| film.read(cycle).unwrap())
-        .map(|transport| error_of(transport.view(), u_min, sim))
+        .map(|transport| error_of(transport.t.view(), u_min, sim))
         .collect();
     errors.sort_by(f64::total_cmp);
     errors[errors.len() / 2]

@@ -1,8 +1,9 @@
-//! The mask beside each product: what is known of each of its pixels.
+//! The mask beside each product and transport: what is known of each of its values.
 
-use std::ops::RangeInclusive;
+use std::collections::BTreeMap;
+use std::ops::{Range, RangeInclusive};
 
-use ndarray::{Array2, Axis};
+use ndarray::{Array2, Array3, ArrayView3, Axis, s};
 use raysweep_transport::plane::Transport;
 
 use super::spec::ProductKind;
@@ -21,6 +22,46 @@ pub const NO_EDGE: u8 = 16;
 
 /// Rows as near as this to the pixel's own are told apart only by edges of exposures.
 const NEAR_ROWS: RangeInclusive<i32> = -2..=2;
+
+/// Bits of each value of camera rows `rows` of a transport, `[u, t, s]`.
+pub fn of_transport(transport: &Transport, rows: Range<usize>) -> Array3<u8> {
+    let (depth, _, columns) = transport.t.dim();
+    let mut bits = Array3::from_shape_fn((depth, rows.len(), columns), |(u, t, s)| {
+        let row = rows.start + t;
+        let known = if transport.exists[[u, row]] { MEASURED } else { OUTSIDE_REACH };
+        let is_near = NEAR_ROWS.contains(&(transport.u_min + u as i32));
+        known | if is_near && transport.no_edge[[row, s]] { NO_EDGE } else { 0 }
+    });
+    for (&[t, s], bounds) in transport.lower_bounds.range([rows.start, 0]..[rows.end, 0]) {
+        let of_pixel = bits.slice_mut(s![.., t - rows.start, s]);
+        for (bits, _) in of_pixel.into_iter().zip(bounds).filter(|(_, is_bound)| **is_bound) {
+            *bits = *bits & !MEASURED | BOUND_ONLY;
+        }
+    }
+    bits
+}
+
+/// The transport whose values and bits, both `[u, t, s]`, were stored. Of the pixels with samples that saturate, it names
+/// those some of whose light is only a bound.
+pub fn stored_transport(t: Array3<f32>, u_min: i32, bits: ArrayView3<'_, u8>) -> Transport {
+    let (depth, rows, columns) = t.dim();
+    let has = |pixel: [usize; 2], bit: u8| {
+        bits.slice(s![.., pixel[0], pixel[1]]).iter().map(|bits| bits & bit != 0).collect::<Vec<bool>>()
+    };
+    let pixels = (0..rows).flat_map(|t| (0..columns).map(move |s| [t, s]));
+    let lower_bounds: BTreeMap<[usize; 2], Vec<bool>> = pixels
+        .map(|pixel| (pixel, has(pixel, BOUND_ONLY)))
+        .filter(|(_, bounds)| bounds.contains(&true))
+        .collect();
+    Transport {
+        exists: Array2::from_shape_fn((depth, rows), |(u, t)| bits[[u, t, 0]] & OUTSIDE_REACH == 0),
+        saturated: Array2::from_shape_fn((rows, columns), |(t, s)| lower_bounds.contains_key(&[t, s])),
+        no_edge: Array2::from_shape_fn((rows, columns), |(t, s)| has([t, s], NO_EDGE).contains(&true)),
+        t,
+        u_min,
+        lower_bounds,
+    }
+}
 
 /// Bits of a product's pixels, `[t, s]`, for the camera rows starting at `first_row`, to which stack and transport
 /// belong.

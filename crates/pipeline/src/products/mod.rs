@@ -3,7 +3,6 @@
 
 mod assembly;
 mod band;
-mod frame;
 pub mod mask;
 mod profile;
 mod relight;

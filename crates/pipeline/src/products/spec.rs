@@ -152,6 +152,25 @@ impl ProductSpec {
         Some(format!("product {}: {what}", self.name))
     }
 
+    /// Why it cannot be made of a film's cycles, if it cannot.
+    pub fn not_of_a_film(&self) -> Option<String> {
+        let what = match &self.kind {
+            ProductKind::Epipolar(_)
+            | ProductKind::NonEpipolar(_)
+            | ProductKind::Band(_)
+            | ProductKind::Uncertainty(_)
+            | ProductKind::PriorBias(_) => return None,
+            ProductKind::Relight(relight) if !relight.is_sequence() => return None,
+            ProductKind::Relight(_) => {
+                "line gives a sequence of images, and a film has one for each cycle: use rows or stripes"
+            }
+            ProductKind::Regular | ProductKind::DelayProfile(_) => {
+                "needs the images of a sweep: a film's products are epipolar, non-epipolar, band, relight, uncertainty and prior-bias"
+            }
+        };
+        Some(format!("product {}: {what}", self.name))
+    }
+
     /// The number of its images on this rig.
     pub fn images(&self, geometry: &SweepGeometry) -> usize {
         match &self.kind {

@@ -1,5 +1,6 @@
 //! Films: one light transport per cycle of a few settings.
 
+mod frames;
 mod process;
 mod product;
 mod report;
@@ -8,4 +9,4 @@ mod task;
 pub use self::process::process;
 pub use self::product::{FilmProducts, write_products};
 pub use self::report::{note_findings, shortcomings, write as write_report};
-pub use self::task::{FilmTask, create_transports};
+pub use self::task::{FilmTask, create_transports, write_transport};

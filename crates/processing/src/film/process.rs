@@ -2,20 +2,16 @@
 
 use std::sync::Arc;
 
-use ndarray::{Array2, Axis};
 use raysweep_config::FilmPlan;
-use raysweep_core::{Counts, SettingsId};
-use raysweep_pipeline::{Point, ProductSpec, Stages, Unit, run_stages};
+use raysweep_pipeline::{ProductSpec, Stages};
 use raysweep_session::Session;
-use raysweep_session::film::{CycleEntry, crc32};
 use raysweep_session::ledger::State;
-use raysweep_session::stack::ArrayName;
-use raysweep_transport::plane::Setting;
 
+use super::frames::{NO_DARK, StoredCycle, StoredFrames};
 use super::product::write_products;
 use super::report::{self, forget_findings, note_findings};
-use super::task::{FilmTask, create_transports};
-use crate::plane::{append_argument, manifest, unit_of};
+use super::task::{FilmTask, create_transports, write_transport};
+use crate::plane::{append_argument, manifest};
 use crate::stored::{Asked, ProcessError, Processed, Stored};
 
 /// Recomputes the transports of a stored film, and its products.
@@ -35,7 +31,7 @@ pub fn process(stored: &Stored<'_>, film: FilmPlan, asked: &Asked) -> Result<Pro
     let mut state = State::clone(state);
     let mut problems = make_transports(session, &task, &mut state, &stages)?;
     let state = &state;
-    let mut products = write_products(session, state, &task, &specs, &is_wanted, &|| true)?;
+    let mut products = write_products(session, state, &task, &stages, &specs, &is_wanted, &|| true)?;
     problems.append(&mut products.problems);
     report::write(session, state, &task, &products, &problems)?;
     manifest::write(session, state, &task.task, &rig)?;
@@ -90,82 +86,31 @@ fn make_transports(
             return Ok(problems);
         }
     };
-    let Some(dark) = dark_image(session, state, stages)? else {
-        problems.push("the dark image is missing or damaged: no transport can be made without it".into());
+    let Some(frames) = StoredFrames::open(session, state, task, stages)? else {
+        problems.push(NO_DARK.into());
         return Ok(problems);
     };
-    let film = session.film()?;
     let transports = create_transports(session, task, solver.reach_rows())?;
     let mut summary = state.film.clone().unwrap_or_default();
     forget_findings(&mut summary);
     for entry in state.cycles() {
-        let frames = match film.read(entry.cycle) {
-            Ok(Some(frames)) if crc32(frames.view()) == entry.crc32 => frames,
-            Ok(_) => {
-                problems.push(format!(
-                    "cycle {} is damaged: its checksum differs from the ledger's",
-                    entry.cycle
-                ));
-                continue;
-            }
-            Err(error) => {
-                problems.push(format!("cycle {} is damaged ({error})", entry.cycle));
-                continue;
-            }
-        };
-        let images = frames.axis_iter(Axis(0)).zip(task.task.settings()).zip(&entry.delays_us).map(
-            |((frame, (ordinal, point)), &delay_us)| {
-                let unit = frame_unit((ordinal, point), entry, delay_us, frame.mapv(u32::from));
-                let setting = Setting::new(delay_us, entry.exposure_us);
-                run_stages(stages, &unit).map(|image| (setting, Arc::new(image)))
-            },
-        );
-        let solved =
-            images.collect::<Result<Vec<_>, _>>().map_err(|error| error.to_string()).and_then(|images| {
-                match solver.solve(&images, &dark, &|| true) {
-                    Ok(transport) => Ok((transport, images)),
-                    Err(error) => Err(error.to_string()),
-                }
-            });
+        let frames_of = frames.read(entry);
+        let solved = frames_of.and_then(|StoredCycle { frames: of_cycle, .. }| {
+            let solved = solver.solve(&of_cycle, &frames.dark, &|| true);
+            solved
+                .map(|transport| (transport, of_cycle))
+                .map_err(|error| format!("cycle {}: {error}", entry.cycle))
+        });
         match solved {
-            Ok((transport, images)) => {
-                transports.write(entry.cycle, transport.t.view())?;
-                if let Some(learned) = solver.learn(&images, &dark) {
+            Ok((transport, of_cycle)) => {
+                write_transport(&transports, entry.cycle, &transport)?;
+                if let Some(learned) = solver.learn(&of_cycle, &frames.dark) {
                     note_findings(&mut summary, learned);
                 }
             }
-            Err(error) => problems.push(format!("cycle {}: {error}", entry.cycle)),
+            Err(problem) => problems.push(problem),
         }
     }
     state.film = Some(summary);
     Ok(problems)
-}
-
-fn frame_unit((ordinal, point): (u32, &Point), entry: &CycleEntry, delay_us: f64, sum: Array2<u32>) -> Unit {
-    Unit {
-        id: SettingsId { point: ordinal, attempt: entry.cycle as u32 },
-        frames: 1,
-        delay_us: point.delay_us,
-        exposure_us: entry.exposure_us,
-        delays_us: vec![delay_us],
-        run: 0,
-        starts_ns: Vec::new(),
-        sum: Arc::new(sum),
-        clipped: None,
-        counts: Counts::default(),
-    }
-}
-
-/// The stored dark image after all stages, if it is intact.
-fn dark_image(
-    session: &Session,
-    state: &State,
-    stages: &Stages,
-) -> raysweep_session::Result<Option<Array2<f32>>> {
-    let Some(entry) = state.point(ArrayName::Dark, 0) else { return Ok(None) };
-    let sum = session.stack()?.read_point(ArrayName::Dark, 0)?;
-    if raysweep_session::stack::crc32(sum.view()) != entry.crc32 {
-        return Ok(None);
-    }
-    Ok(run_stages(stages, &unit_of(0, entry, sum, None)).ok())
 }

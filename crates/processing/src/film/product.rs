@@ -1,16 +1,18 @@
 //! The products of a film: one video each, with an image for each cycle that has a transport.
 
-use ndarray::{Array2, Axis};
-use raysweep_pipeline::ProductSpec;
-use raysweep_session::film::{CycleEntry, TransportFilm};
+use ndarray::Array2;
+use raysweep_pipeline::{FilmSolver, Product, ProductSpec, Stages, SweepStack, mask};
+use raysweep_session::film::{CycleEntry, CycleTransport, TransportFilm};
 use raysweep_session::ledger::State;
 use raysweep_session::products::{VideoWriter, video_tone_map};
 use raysweep_session::report::{Picture, ToneMap};
 use raysweep_session::{Result, Session};
-use raysweep_transport::plane::{Beam, Transport};
+use raysweep_transport::plane::Transport;
 use serde_json::json;
 
+use super::frames::{NO_DARK, StoredCycle, StoredFrames};
 use super::task::FilmTask;
+use crate::plane::mask_bits;
 use crate::video::Encoder;
 
 /// Images of a product in the report.
@@ -33,9 +35,8 @@ pub(super) struct FilmVideo {
     pub pictures: Vec<Picture>,
 }
 
-/// Makes the products of a film from its stored transports, and writes those with a wanted name; all are shown in the
-/// report. Returns early, with what is made so far, soon after `go_on`
-/// returns false.
+/// Makes the products of a film from its stored transports and frames, and writes those with a wanted name; all are
+/// shown in the report. Returns early, with what is made so far, soon after `go_on` returns false.
 ///
 /// # Errors
 /// When the session cannot be read or written.
@@ -43,6 +44,7 @@ pub fn write_products(
     session: &Session,
     state: &State,
     task: &FilmTask,
+    stages: &Stages,
     specs: &[ProductSpec],
     is_wanted: &dyn Fn(&str) -> bool,
     go_on: &dyn Fn() -> bool,
@@ -51,45 +53,41 @@ pub fn write_products(
     if specs.is_empty() {
         return Ok(made);
     }
-    let transports = TransportFilm::open(&session.transport_film_path())?;
-    let u_min = transports.attributes().get("u_min").and_then(|u_min| i32::try_from(u_min.as_i64()?).ok());
-    let mut cycles = Vec::new();
-    for entry in state.cycles() {
-        if transports.contains(entry.cycle)? {
-            cycles.push(entry);
-        }
-    }
-    let (Some(u_min), false) = (u_min, cycles.is_empty()) else {
-        made.problems.push("no cycle has a transport, so no product is made".into());
-        return Ok(made);
-    };
-    let found = state.film.clone().unwrap_or_default();
-    let timing = task.task.geometry.timing().and_then(|timing| match found.beam_sigma_rows {
-        Some(sigma_rows) => timing.with_beam(Beam::of_sigma(sigma_rows)),
-        None => Ok(timing),
-    });
-    let timing = match timing {
-        Ok(timing) => timing,
-        Err(error) => {
-            made.problems.push(error.to_string());
+    let mut source = match Source::open(session, state, task, stages)? {
+        Ok(source) => source,
+        Err(problem) => {
+            made.problems.push(problem);
             return Ok(made);
         }
     };
+    let cycles = source.cycles(state)?;
+    if cycles.is_empty() {
+        made.problems.push("no cycle has a transport, so no product is made".into());
+        return Ok(made);
+    }
+    source.learn(&cycles);
     let mut drafts: Vec<Draft<'_>> =
         specs.iter().map(|spec| Draft::new(spec, is_wanted(spec.name()))).collect();
-    for (number, entry) in cycles.iter().enumerate() {
+    for number in 0..cycles.len() {
         if !go_on() {
             return Ok(made);
         }
-        let Some(t) = transports.read(entry.cycle)? else { continue };
-        let exists = Array2::from_elem((t.len_of(Axis(0)), t.len_of(Axis(1))), true);
-        let transport = Transport::measured(t, u_min, exists);
+        let (stack, transport) = match source.cycle(number, cycles[number])? {
+            Ok(cycle) => cycle,
+            Err(problem) => {
+                made.problems.push(format!("{problem}, so no product is made"));
+                return Ok(made);
+            }
+        };
         let mut sound = Vec::new();
         for mut draft in drafts {
-            match draft.spec.frame(&timing, &transport, found.one_band) {
-                Ok((image, about)) => {
-                    draft.append(session, task, &cycles, (number, image), about)?;
+            match draft.spec.make(&stack, &transport) {
+                Ok(Product::Image { about, image, mask, .. }) => {
+                    draft.append(session, task, &cycles, number, (image, mask), about)?;
                     sound.push(draft);
+                }
+                Ok(_) => {
+                    made.problems.push(format!("product {}: it is more than one image", draft.spec.name()))
                 }
                 Err(error) => made.problems.push(error.to_string()),
             }
@@ -106,6 +104,70 @@ pub fn write_products(
     }
     made.problems.append(&mut encoder.problems);
     Ok(made)
+}
+
+/// What products are made from.
+struct Source<'a> {
+    transports: TransportFilm,
+    u_min: i32,
+    frames: StoredFrames<'a>,
+    solver: FilmSolver,
+}
+
+impl<'a> Source<'a> {
+    fn open(
+        session: &Session,
+        state: &State,
+        task: &'a FilmTask,
+        stages: &'a Stages,
+    ) -> Result<std::result::Result<Self, String>> {
+        let Some(frames) = StoredFrames::open(session, state, task, stages)? else {
+            return Ok(Err(NO_DARK.into()));
+        };
+        let transports = TransportFilm::open(&session.transport_film_path())?;
+        let solver = task.solver().map_err(|error| error.to_string());
+        Ok(solver.map(|solver| Self { transports, u_min: solver.reach_rows().0, frames, solver }))
+    }
+
+    /// The cycles that have a transport.
+    fn cycles<'b>(&self, state: &'b State) -> Result<Vec<&'b CycleEntry>> {
+        let mut cycles = Vec::new();
+        for entry in state.cycles() {
+            if self.transports.contains(entry.cycle)? {
+                cycles.push(entry);
+            }
+        }
+        Ok(cycles)
+    }
+
+    /// Learns from the first cycles what the solver of the transports learned from them. What cannot be read is told when
+    /// its product is made.
+    fn learn(&mut self, cycles: &[&CycleEntry]) {
+        for entry in cycles.iter().take(FilmSolver::FIRST_CYCLES) {
+            if let Ok(StoredCycle { frames, .. }) = self.frames.read(entry) {
+                // The film's summary says what was found.
+                let _ = self.solver.learn(&frames, &self.frames.dark);
+            }
+        }
+    }
+
+    /// The stack and the transport of a cycle, the one of this number among those that have one; or what is wrong with it.
+    fn cycle(
+        &self,
+        number: usize,
+        entry: &CycleEntry,
+    ) -> Result<std::result::Result<(SweepStack, Transport), String>> {
+        let cycle = entry.cycle;
+        let Some(CycleTransport { t, mask }) = self.transports.read(cycle)? else {
+            return Ok(Err(format!("the transport of cycle {cycle} is gone")));
+        };
+        let stack = self.frames.read(entry).and_then(|StoredCycle { frames, filled }| {
+            let stack = self.solver.solved_stack(number, &frames, &self.frames.dark);
+            let stack = stack.map_err(|error| format!("cycle {cycle}: {error}"))?;
+            Ok(SweepStack { filled: Some(filled), ..stack })
+        });
+        Ok(stack.map(|stack| (stack, mask::stored_transport(t, self.u_min, mask.view()))))
+    }
 }
 
 /// A product that is being made.
@@ -130,7 +192,8 @@ impl<'a> Draft<'a> {
         session: &Session,
         task: &FilmTask,
         cycles: &[&CycleEntry],
-        (number, image): (usize, Array2<f32>),
+        number: usize,
+        (image, mask): (Array2<f32>, Array2<u8>),
         about: String,
     ) -> Result<()> {
         let tone_map = *self.tone_map.get_or_insert_with(|| video_tone_map(&[image.view()]));
@@ -139,13 +202,15 @@ impl<'a> Draft<'a> {
                 Some(writer) => writer,
                 None => self.writer.insert(begin(session, task, cycles, (self.spec.name(), &about), &image)?),
             };
-            writer.append(image.view().insert_axis(Axis(2)))?;
+            writer.append_masked(image.view(), mask.view())?;
         }
         self.about = about;
         if number.is_multiple_of(cycles.len().div_ceil(SHOWN)) {
             let entry = cycles[number];
             let caption = format!("cycle {} ({:.2} s)", entry.cycle, entry.start_s);
-            self.pictures.push(Picture::grey(image.view(), tone_map).with_caption(caption));
+            let bounds = mask.mapv(|bits| bits & mask::BOUND_ONLY != 0);
+            self.pictures
+                .push(Picture::grey(image.view(), tone_map).with_caption(caption).with_hatching(bounds));
         }
         Ok(())
     }
@@ -164,6 +229,7 @@ fn begin(
     let start_s: Vec<f64> = cycles.iter().map(|entry| entry.start_s).collect();
     metadata.insert("about".into(), json!(about));
     metadata.insert("axes".into(), json!(["k", "t", "s"]));
+    metadata.insert("mask".into(), mask_bits());
     metadata.insert("k".into(), json!({ "is": "cycle", "at": at, "start_s": start_s }));
     metadata.insert("images_per_s".into(), json!(images_per_s(cycles)));
     session.products().video(name, cycles.len(), [image.nrows(), image.ncols(), 1], &metadata)

@@ -3,7 +3,7 @@
 use ndarray::{Array2, ArrayView2, Axis, s};
 use raysweep_core::{FilmSummary, Percentiles};
 use raysweep_pipeline::{Findings, NotSolved};
-use raysweep_session::film::TransportFilm;
+use raysweep_session::film::{CycleTransport, TransportFilm};
 use raysweep_session::ledger::State;
 use raysweep_session::report::{
     Block, ContactSheet, NoteLevel, Picture, Plot, Report, Section, Series, SeriesStyle, ToneMap,
@@ -155,7 +155,7 @@ fn cycles(session: &Session, state: &State) -> Result<Section> {
         // Damaged cycles are listed among the problems.
         let read = transports.as_ref().and_then(|film| film.read(entry.cycle).ok().flatten());
         let own_row = transports.as_ref().and_then(|film| film.attributes().get("u_min")?.as_i64());
-        if let (Some(transport), Some(u_min)) = (read, own_row) {
+        if let (Some(CycleTransport { t: transport, .. }), Some(u_min)) = (read, own_row) {
             let rows = transport.len_of(Axis(0)) as i64;
             let half = if one_band { 2 } else { 0 };
             // If all delays are long, no pixel's own row is in range.

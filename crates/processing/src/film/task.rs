@@ -3,13 +3,14 @@
 use std::sync::Arc;
 
 use raysweep_config::{ConfigError, FilmPlan, Plan, ProductTable};
-use raysweep_pipeline::{FilmSolver, Point, PointRole, ProductSpec, Schedule, Stages};
+use raysweep_pipeline::{FilmSolver, Point, PointRole, ProductSpec, Schedule, Stages, mask};
 use raysweep_session::film::TransportFilm;
 use raysweep_session::stack::Contents;
 use raysweep_session::{Result, Session};
+use raysweep_transport::plane::Transport;
 use serde_json::json;
 
-use crate::plane::{KnownRig, PlaneTask, planned_products};
+use crate::plane::{KnownRig, PlaneTask, mask_bits, planned_products};
 
 /// Frames of the dark image: its noise enters every cycle, so it averages many.
 const DARK_FRAMES: u32 = 32;
@@ -114,7 +115,16 @@ pub fn create_transports(
         json!("light from projector row v = t + first_row + u to camera pixel (t, s), by cycle; 0 where the projector has no such row, NaN where the cycle was not estimated"),
     );
     let cycle = [(u_max - u_min + 1) as usize, geometry.height, geometry.width];
-    TransportFilm::create(&session.transport_film_path(), task.points(), cycle, &attributes)
+    TransportFilm::create(&session.transport_film_path(), task.points(), cycle, &attributes, &mask_bits())
+}
+
+/// Writes the transport of a cycle, with its mask.
+///
+/// # Errors
+/// When the session cannot be written.
+pub fn write_transport(transports: &TransportFilm, cycle: usize, transport: &Transport) -> Result<()> {
+    let mask = mask::of_transport(transport, 0..transport.exists.ncols());
+    transports.write(cycle, transport.t.view(), mask.view())
 }
 
 #[cfg(test)]

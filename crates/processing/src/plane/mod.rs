@@ -7,6 +7,6 @@ pub mod report;
 mod task;
 
 pub use self::processing::Processing;
-pub(crate) use self::products::{append_argument, planned_products};
+pub(crate) use self::products::{append_argument, mask_bits, planned_products};
 pub(crate) use self::task::unit_of;
 pub use self::task::{KnownCalibration, KnownRig, PlaneTask, check_mosaic, place};

@@ -2,7 +2,8 @@
 
 use raysweep_config::plan::products_of_argument;
 use raysweep_config::{ConfigError, Places, ProductTable};
-use raysweep_pipeline::ProductSpec;
+use raysweep_pipeline::{ProductSpec, mask};
+use serde_json::{Value, json};
 
 use super::PlaneTask;
 
@@ -68,4 +69,15 @@ fn append_product(
     }
     specs.push(spec);
     Ok(())
+}
+
+/// The bits of masks, as metadata say them.
+pub(crate) fn mask_bits() -> Value {
+    json!({
+        "measured": mask::MEASURED,
+        "bound only": mask::BOUND_ONLY,
+        "hot pixel filled": mask::HOT_PIXEL_FILLED,
+        "outside reach": mask::OUTSIDE_REACH,
+        "no edge": mask::NO_EDGE,
+    })
 }

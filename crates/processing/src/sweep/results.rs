@@ -1,8 +1,5 @@
 //! Writes the products to files.
 
-use std::ops::Range;
-
-use ndarray::{Array3, s};
 use raysweep_pipeline::{Findings, Product, Solved, Strip, SweepSummary, mask};
 use raysweep_session::STRIP_ROWS;
 use raysweep_session::ledger::State;
@@ -12,7 +9,7 @@ use raysweep_transport::plane::Transport;
 use serde_json::{Map, Value, json};
 
 use super::strips::{Overview, StoredImages};
-use crate::plane::{PlaneTask, Processing};
+use crate::plane::{PlaneTask, Processing, mask_bits};
 
 /// The results of a sweep.
 #[derive(Default)]
@@ -162,7 +159,7 @@ impl TransportWriter {
             zarr.append(rows.t.view())?;
             let height = rows.exists.ncols();
             (0..height).step_by(STRIP_ROWS).try_for_each(|first_row| {
-                let mask = mask_of(rows, first_row..height.min(first_row + STRIP_ROWS));
+                let mask = mask::of_transport(rows, first_row..height.min(first_row + STRIP_ROWS));
                 zarr.append_mask(mask.view(), &mask_bits())
             })
         };
@@ -232,33 +229,6 @@ pub fn write_products(
         }
     }
     Ok(())
-}
-
-/// What is known of each value of some camera rows of a transport, `[u, t, s]`.
-fn mask_of(transport: &Transport, rows: Range<usize>) -> Array3<u8> {
-    let (depth, _, columns) = transport.t.dim();
-    let mut bits = Array3::from_shape_fn((depth, rows.len(), columns), |(u, t, _)| {
-        if transport.exists[[u, rows.start + t]] { mask::MEASURED } else { mask::OUTSIDE_REACH }
-    });
-    for (&[t, s], bounds) in transport.lower_bounds.range([rows.start, 0]..[rows.end, 0]) {
-        for (bits, _) in
-            bits.slice_mut(s![.., t - rows.start, s]).iter_mut().zip(bounds).filter(|(_, bound)| **bound)
-        {
-            *bits = mask::BOUND_ONLY;
-        }
-    }
-    bits
-}
-
-/// The bits of masks, as metadata say them.
-fn mask_bits() -> Value {
-    json!({
-        "measured": mask::MEASURED,
-        "bound only": mask::BOUND_ONLY,
-        "hot pixel filled": mask::HOT_PIXEL_FILLED,
-        "outside reach": mask::OUTSIDE_REACH,
-        "no edge": mask::NO_EDGE,
-    })
 }
 
 /// The model and settings that the transport was estimated with.

@@ -2,10 +2,10 @@
 
 use std::io;
 use std::os::unix::fs::FileExt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use ndarray::{ArrayView2, ArrayView3, Axis};
-use ndarray_npy::write_zeroed_npy;
+use ndarray::{Array2, ArrayView2, ArrayView3, Axis, IxDyn};
+use ndarray_npy::{WritableElement, write_zeroed_npy};
 use serde_json::{Map, Value};
 
 use super::{Products, sidecar};
@@ -19,9 +19,12 @@ const HEADROOM: f32 = 1.25;
 
 /// Writes a video `NAME`: `NAME.npy` (float32 `[k, t, s]`, or `[k, t, s, 3]`), a folder `NAME` with
 /// `0000.exr` (linear), `0000.png` (all with one tone map, sRGB transfer function) and so on, and
-/// `NAME.json`. Nothing is visible before [`VideoWriter::commit`], and nothing is kept without it.
+/// `NAME.json`; if its images have masks, `NAME_mask.npy` (uint8 `[k, t, s]`). Nothing is visible before [`VideoWriter::commit`], and nothing is kept without it.
 pub struct VideoWriter {
     npy: DraftFile,
+    /// The masks and the length of their file's header, once there is one.
+    masks: Option<(DraftFile, u64)>,
+    masks_path: PathBuf,
     frames: DraftDir,
     sidecar: PathBuf,
     name: String,
@@ -55,16 +58,12 @@ impl Products {
         }
         let (path, sidecar) = (self.path(name, "npy")?, self.path(name, "json")?);
         durable::create_dir_within(self.dir())?;
-        let npy = DraftFile::create(&path)?;
-        let zeroed = match channels {
-            1 => write_zeroed_npy::<f32, _>(npy.file(), (images, rows, columns)),
-            _ => write_zeroed_npy::<f32, _>(npy.file(), (images, rows, columns, channels)),
-        };
-        zeroed.map_err(io::Error::other).map_err(npy.failed())?;
-        let file_bytes = npy.file().metadata().map_err(npy.failed())?.len();
-        let header_bytes = file_bytes - (images * rows * columns * channels * size_of::<f32>()) as u64;
+        let axes = [images, rows, columns, channels];
+        let (npy, header_bytes) = begun_npy::<f32>(&path, if channels == 1 { &axes[..3] } else { &axes })?;
         Ok(VideoWriter {
             npy,
+            masks: None,
+            masks_path: self.path(&format!("{name}_mask"), "npy")?,
             frames: DraftDir::create(&self.dir().join(name))?,
             sidecar,
             name: name.to_owned(),
@@ -83,6 +82,31 @@ impl VideoWriter {
     /// # Errors
     /// [`Error::Shape`] for an image of another size, or too many; [`Error::Io`].
     pub fn append(&mut self, image: ArrayView3<f32>) -> Result<ToneMap> {
+        self.append_with(image, None)
+    }
+
+    /// Writes the next image `[t, s]` of a video that has masks, with its mask: its EXR file has the channel `mask`.
+    ///
+    /// # Errors
+    /// As [`Self::append`].
+    pub fn append_masked(&mut self, image: ArrayView2<f32>, mask: ArrayView2<u8>) -> Result<ToneMap> {
+        let [images, rows, columns, _] = self.shape;
+        if mask.dim() != (rows, columns) || self.next == images {
+            let (what, found) = (format!("a mask of video `{}`", self.name), mask.shape().to_vec());
+            return Err(Error::Shape { what, found, allowed: format!("{images} of {:?}", [rows, columns]) });
+        }
+        let (file, header_bytes) = match self.masks.take() {
+            Some(masks) => masks,
+            None => begun_npy::<u8>(&self.masks_path, &[images, rows, columns])?,
+        };
+        let bytes: Vec<u8> = mask.iter().copied().collect();
+        let at = header_bytes + (self.next * bytes.len()) as u64;
+        file.file().write_all_at(&bytes, at).map_err(file.failed())?;
+        self.masks = Some((file, header_bytes));
+        self.append_with(image.insert_axis(Axis(2)), Some(mask.mapv(f32::from)))
+    }
+
+    fn append_with(&mut self, image: ArrayView3<f32>, mask: Option<Array2<f32>>) -> Result<ToneMap> {
         let [images, rows, columns, channels] = self.shape;
         if image.dim() != (rows, columns, channels) || self.next == images {
             let mut found = vec![self.next];
@@ -96,7 +120,8 @@ impl VideoWriter {
         let planes: Vec<_> = image.axis_iter(Axis(2)).collect();
         let tone_map = *self.tone_map.get_or_insert_with(|| video_tone_map(&planes));
         let names: &[&str] = if channels == 1 { &["Y"] } else { &["R", "G", "B"] };
-        let exr: Vec<_> = names.iter().copied().zip(planes.iter().map(|plane| plane.view())).collect();
+        let mut exr: Vec<_> = names.iter().copied().zip(planes.iter().map(|plane| plane.view())).collect();
+        exr.extend(mask.as_ref().map(|mask| ("mask", mask.view())));
         let picture = match channels {
             1 => Picture::grey(planes[0], tone_map),
             _ => Picture::rgb(image, tone_map),
@@ -119,11 +144,21 @@ impl VideoWriter {
             return Err(Error::Shape { what, found: vec![self.next], allowed: format!("[{images}]") });
         }
         self.npy.commit()?;
+        self.masks.map_or(Ok(()), |(masks, _)| masks.commit())?;
         self.frames.commit()?;
         let mut metadata = self.metadata;
         metadata.insert("png_white".into(), self.tone_map.map_or(Value::Null, |map| map.white.into()));
         durable::write(&self.sidecar, &sidecar(&self.name, &metadata)?)
     }
+}
+
+/// An NPY file of zeros that is not in place yet, and the length of its header.
+fn begun_npy<T: WritableElement>(path: &Path, axes: &[usize]) -> Result<(DraftFile, u64)> {
+    let npy = DraftFile::create(path)?;
+    write_zeroed_npy::<T, _>(npy.file(), IxDyn(axes)).map_err(io::Error::other).map_err(npy.failed())?;
+    let file_bytes = npy.file().metadata().map_err(npy.failed())?.len();
+    let data_bytes = axes.iter().product::<usize>() * size_of::<T>();
+    Ok((npy, file_bytes - data_bytes as u64))
 }
 
 /// The tone map of a video whose first image has these planes.

@@ -27,6 +27,9 @@ use crate::run::error::RunError;
 use crate::run::life::Run;
 use crate::run::orders::Orders;
 
+/// Most times that the path is played for the frames without light, if the camera loses some.
+const MOST_DARK_PASSES: u32 = 5;
+
 /// Result of acquisition.
 pub struct Acquired {
     /// The session.
@@ -185,7 +188,8 @@ impl DotPasses<'_> {
         Ok(Some(sensor))
     }
 
-    /// Takes frames with the mirror's light off, until `push` needs no more; returns whether the run continues.
+    /// Takes frames with the mirror's light off, until `push` needs no more; returns whether the run continues. Lost frames
+    /// are taken again, a few times.
     fn without_light(
         &mut self,
         wanted: u32,
@@ -196,26 +200,33 @@ impl DotPasses<'_> {
         let (mut counts, mut failed, mut frames) = (vec![0; task.shape.values()], None, 0);
         let has_enough = AtomicBool::new(false);
         let rounds = task.batches.dark_rounds(wanted);
-        let lost = self.player.play(&path, rounds, wanted.into(), &has_enough, &mut |arrival| {
-            // Some more frames arrive while waiting for the camera's last one.
-            if !has_enough.load(Ordering::Relaxed) {
-                let unpacked = task.format.unpack_into(&arrival.frame.data, &mut counts);
-                let pushed = match unpacked {
-                    Ok(()) => push(&counts).map_err(RunError::from),
-                    Err(error) => Err(RunError::Frame(error.to_string())),
-                };
-                match pushed {
-                    Ok(wants_more) => has_enough.store(!wants_more, Ordering::Relaxed),
-                    Err(error) => {
-                        failed = Some(error);
-                        return Err(FrameRefused::Closed);
+        for _ in 0..MOST_DARK_PASSES {
+            let lost = self.player.play(&path, rounds, wanted.into(), &has_enough, &mut |arrival| {
+                // Some more frames arrive while waiting for the camera's last one.
+                if !has_enough.load(Ordering::Relaxed) {
+                    let unpacked = task.format.unpack_into(&arrival.frame.data, &mut counts);
+                    let pushed = match unpacked {
+                        Ok(()) => push(&counts).map_err(RunError::from),
+                        Err(error) => Err(RunError::Frame(error.to_string())),
+                    };
+                    match pushed {
+                        Ok(wants_more) => has_enough.store(!wants_more, Ordering::Relaxed),
+                        Err(error) => {
+                            failed = Some(error);
+                            return Err(FrameRefused::Closed);
+                        }
                     }
                 }
+                frames += 1 + arrival.lost_before.iter().map(|loss| loss.frames).sum::<u64>();
+                Ok(())
+            })?;
+            frames += lost.iter().map(|loss| loss.frames).sum::<u64>();
+            let is_over = failed.is_some() || has_enough.load(Ordering::Relaxed);
+            // A recording has no more frames.
+            if is_over || self.player.is_recorded() || !self.orders.go_on() {
+                break;
             }
-            frames += 1 + arrival.lost_before.iter().map(|loss| loss.frames).sum::<u64>();
-            Ok(())
-        })?;
-        frames += lost.iter().map(|loss| loss.frames).sum::<u64>();
+        }
         // No batch needs these frames.
         self.storage.outside(Counts { expected: frames, settling: frames, ..Counts::default() });
         match failed {

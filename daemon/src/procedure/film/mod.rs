@@ -219,7 +219,7 @@ impl FilmRun {
 /// Makes a film's products, and writes its report. Its transports exist already, so a film that was ended early is like
 /// a short one; but its products are not made, so that it ends soon.
 fn conclude(acquired: Acquired, run: &FilmRun, orders: &Orders) -> Result<Ended, RunError> {
-    let FilmRun { rig, film, products, .. } = run;
+    let FilmRun { rig, film, products, stages, .. } = run;
     let Acquired { session, mut ledger, mut problems, vsync, exposures, latency, fault } = acquired;
     let state = end_state(fault.as_ref(), orders);
     let stored = ledger.state().stored_points();
@@ -234,7 +234,9 @@ fn conclude(acquired: Acquired, run: &FilmRun, orders: &Orders) -> Result<Ended,
     };
     let go_on = || orders.go_on();
     let mut made = match state {
-        EndState::Complete => write_products(&session, ledger.state(), film, products, &|_| true, &go_on)?,
+        EndState::Complete => {
+            write_products(&session, ledger.state(), film, stages, products, &|_| true, &go_on)?
+        }
         EndState::Cancelled | EndState::Faulted => FilmProducts::default(),
     };
     problems.append(&mut made.problems);

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use ndarray::Array2;
 use raysweep_core::{Clock, FilmSummary, Percentiles};
 use raysweep_pipeline::{FilmSolver, PipelineError};
-use raysweep_processing::film::note_findings;
+use raysweep_processing::film::{note_findings, write_transport};
 use raysweep_proto::{Event, FilmEstimate};
 use raysweep_session::film::TransportFilm;
 use raysweep_transport::plane::{Setting, Transport};
@@ -252,7 +252,7 @@ impl Solving {
                 }
             };
             self.publish(&exposed, is_sliding, &transport, solve_time);
-            let store = || self.transports.write(*cycle as usize, transport.t.view());
+            let store = || write_transport(&self.transports, *cycle as usize, &transport);
             if !is_sliding && let Err(error) = write_patiently(&self.orders, &self.board, store) {
                 tracing::error!(%error, cycle, "transport not stored");
                 self.orders.give(Order::Fault);
