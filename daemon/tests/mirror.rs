@@ -164,7 +164,7 @@ impl Lab {
         let step = held.windows(2).map(|pair| step_codes(&pair[0], &pair[1])).fold(0.0, f64::max);
         // Two codes: rounding at both ends.
         let allowed = most_codes + 2.0;
-        assert!(step <= allowed, "{way}: a step of {step} codes, {allowed} are allowed");
+        assert!(step <= allowed, "{way}: a step of {step} codes, {allowed} are allowed\n{}", self.log());
         let ms = |ns: i64| (ns - since_ns) as f64 / 1e6;
         println!("{way}: light off after {:.1} ms, mirror parked after {:.1} ms", ms(dark_ns), ms(parked_ns));
     }

@@ -98,8 +98,8 @@ impl Player<'_> {
                 .map_err(|source| PipelineError::Spawn { name: "camera", source: source.into() })?;
             let motion = &mut *self.motion;
             let mirror = thread::Builder::new().name("mirror".into()).spawn_scoped(scope, || {
-                // A controller that runs out of samples lets the mirror stand.
-                if pace == Pace::Devices && !is_simulated && is_driven {
+                // A controller that runs out of samples lets the mirror stand, whatever camera sees it.
+                if pace == Pace::Devices && is_driven {
                     priority::for_device("mirror");
                 }
                 let _over = SetOnDrop(&path_over);
