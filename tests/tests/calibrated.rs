@@ -101,6 +101,7 @@ impl Studio {
             drawing: None,
             white_dn: Array2::from_shape_fn(size, |(t, s)| self.white_dn(t, s) as f32),
             curve: None,
+            saturation_dn: None,
             noise: NoiseModel { read_variance: 6e-5, gain: 2.4e-4 },
             strip: None,
             lamp: None,

@@ -6,11 +6,12 @@
 use std::fs;
 use std::path::Path;
 
-use ndarray::{Array3, Axis, s};
+use ndarray::{Array2, Array3, Axis, s};
 use raysweep::control::Control;
 use raysweep::rig::Rig;
 use raysweep_config::Plan;
 use raysweep_config::plan::CalibrationPlan;
+use raysweep_pipeline::mask;
 use raysweep_processing::calibration::{CalibrationTask, KeptCalibration, current_in};
 use raysweep_processing::plane::KnownRig;
 use raysweep_session::film::TransportFilm;
@@ -201,10 +202,11 @@ fn sessions_of_earlier_versions_have_fewer_images_and_are_known_by_them() {
     let stored = |contents| CalibrationTask::stored(&plan, own.clone(), &known, contents);
     let now = CalibrationTask::new(&plan, own.clone(), &known).contents();
     let Contents::Board { images, capped } = now else { panic!("{now:?}") };
-    let columns = 2 * 7;
+    let saturated = 4;
+    let columns = saturated + 2 * 7;
     let passes = columns + 3 * 8;
     let black = passes + 2 * own.frames as usize;
-    for fewer in [0, columns, passes, black] {
+    for fewer in [0, saturated, columns, passes, black] {
         let contents = Contents::Board { images: images - fewer, capped };
         assert_eq!(stored(contents).contents(), contents);
     }
@@ -370,4 +372,37 @@ fn calibrations_are_listed_and_chosen() {
     let refused = control.use_calibration(Path::new("none")).unwrap_err();
     assert!(refused.message.contains("`raysweep sessions` lists the names"), "{}", refused.message);
     assert!(sweep.session.join("calibration.toml").exists());
+}
+
+/// A sensor whose wells are full at three quarters of the converter's range: samples beyond that are bounds, not light.
+#[test]
+fn wells_that_are_full_before_the_converter_are_found_and_what_fills_them_is_marked() {
+    const FULL_DN: f64 = 3000.0;
+    let sensor = format!("[sim.sensor]\nfull_well_e = {}\n", FULL_DN * 1.66);
+    let bench = Bench::new(&corner(&sensor));
+    let rig = Rig::load(&bench.folder.path().join("rig.toml")).unwrap();
+    let calibrated = bench.run(PLAN);
+    assert_eq!(calibrated.state, "complete", "{:?}", calibrated.error);
+    let light = kept(&calibrated.session).header.light;
+    let saturation_dn = light.saturation_dn.unwrap();
+    println!("pixels saturate from {saturation_dn} DN");
+    // Black is 64, and the limit a few standard deviations of the read noise below the well.
+    assert!((FULL_DN..FULL_DN + 64.0).contains(&saturation_dn), "{saturation_dn}");
+    let swept = bench.run(&format!("product = [{{ kind = \"epipolar\" }}]\n{SWEEP}"));
+    assert_eq!(swept.state, "complete", "{:?}", swept.error);
+    let [found, truth] = transports(&swept, rig.simulated().unwrap());
+    let mask: Array2<u8> = ndarray_npy::read_npy(swept.session.join("products/epipolar_mask.npy")).unwrap();
+    let is_bound = mask.mapv(|bits| bits & mask::BOUND_ONLY != 0);
+    let bounds = is_bound.iter().filter(|bound| **bound).count();
+    let direct = -*SEEN.start() as usize;
+    let (mut off, mut unmarked) = (0, 0);
+    for ((t, s), is_bound) in is_bound.indexed_iter() {
+        let [found, truth] = [found[[direct, t, s]], truth[[direct, t, s]]];
+        if f64::from(truth) * light.white_dn[0] > FULL_DN && (found / truth - 1.0).abs() > 0.05 {
+            off += 1;
+            unmarked += usize::from(!is_bound);
+        }
+    }
+    println!("{bounds} pixels are bounds, {off} full ones are off by 5 %, {unmarked} of them not marked");
+    assert!(bounds > 0 && unmarked == 0);
 }

@@ -167,6 +167,9 @@ impl SweepGeometry {
             first_row,
             camera_row_time_us,
             white_dn: white_dn.get(white_dn.len() / 2).map_or(self.white_dn, |&dn| f64::from(dn)),
+            saturation_dn: calibration
+                .saturation_dn
+                .map_or(self.saturation_dn, |dn| dn.min(self.saturation_dn)),
             calibration: Some(calibration),
             ..self
         }

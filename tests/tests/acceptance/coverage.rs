@@ -114,6 +114,37 @@ fn true_light(sim: &PlaneRig, [from, to]: [i32; 2]) -> Array2<f32> {
     far.fold(Array2::zeros((rows.len_of(Axis(1)), rows.len_of(Axis(2)))), |sum, (row, _)| sum + row)
 }
 
+fn print_calibrations(calibrations: &[Errors]) {
+    let runs = calibrations.len() as f64;
+    println!("calibration: shares within one standard deviation, root mean square, mean");
+    for (index, name) in PARAMETERS.iter().enumerate() {
+        let sds = calibrations.iter().map(|errors| errors.sds[index]);
+        let rms = (sds.clone().map(|sds| sds * sds).sum::<f64>() / runs).sqrt();
+        let mean = sds.clone().sum::<f64>() / runs;
+        println!("  {name}: {:.2}, {rms:.2}, {mean:.2}", share(sds));
+    }
+    for (index, name) in ["rows", "places"].iter().enumerate() {
+        let mean = calibrations.iter().map(|errors| errors.within[index]).sum::<f64>() / runs;
+        println!("  {name}: {mean:.2}");
+    }
+}
+
+/// `RUNS` calibrations (400): prints shares within one standard deviation, of which 68 % would be right.
+#[test]
+#[ignore = "hours"]
+fn what_calibrations_state_covers() {
+    let runs: u64 = std::env::var("RUNS").map_or(400, |runs| runs.parse().unwrap());
+    let unknown = UNKNOWN.replace("JITTER", "5.0");
+    let scene = raysweep_tests::data("p2r_corner.npz");
+    let of_seed = |seed| {
+        let (_bench, rig, found) = calibrated(&scene, &format!("seed = {seed}\n{unknown}"));
+        let errors = errors_of(&found, rig.simulated().unwrap());
+        println!("{seed}: {errors:.2?}");
+        errors
+    };
+    print_calibrations(&(1..=runs).map(of_seed).collect::<Vec<_>>());
+}
+
 /// `RUNS` pairs of a calibration and a run (50), of `PLAN` `sweep` or `edges`: prints shares within one standard
 /// deviation, of which 68 % would be right, and of biases within what is stated of them.
 #[test]
@@ -140,16 +171,7 @@ fn what_is_stated_covers() {
             truths = LIGHT.iter().map(|&(_, rows)| true_light(sim, rows)).collect();
         }
     }
-    println!("calibration: shares within one standard deviation, root mean square");
-    for (index, name) in PARAMETERS.iter().enumerate() {
-        let sds = calibrations.iter().map(|errors| errors.sds[index]);
-        let rms = (sds.clone().map(|sds| sds * sds).sum::<f64>() / runs as f64).sqrt();
-        println!("  {name}: {:.2}, {rms:.2}", share(sds));
-    }
-    for (index, name) in ["rows", "places"].iter().enumerate() {
-        let mean = calibrations.iter().map(|errors| errors.within[index]).sum::<f64>() / runs as f64;
-        println!("  {name}: {mean:.2}");
-    }
+    print_calibrations(&calibrations);
     println!(
         "light: within one standard deviation of the mean, of dim pixels, sd over light; within the bias"
     );

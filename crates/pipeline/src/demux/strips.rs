@@ -274,6 +274,7 @@ mod tests {
             response: PixelResponse::with_beam(places, &shares).unwrap(),
             drawing: None,
             white_dn,
+            saturation_dn: None,
             curve: Some(CameraCurve { per_dn: 1e-5, zero_dn: Array2::from_elem((HEIGHT, WIDTH), 100.0) }),
             noise: NoiseModel { read_variance: 0.0, gain: 0.0 },
             strip: None,

@@ -10,6 +10,8 @@ use raysweep_transport::dots::{
 
 /// Number of batches from which the trailing dot's brightness is learnt before the first batch is cut.
 const LEARNT_FROM_BATCHES: usize = 2;
+/// Number of batches' frames that may be given up while too many are lost to learn from.
+const MOST_GIVEN_UP_BATCHES: u64 = 20;
 /// Largest distance of a waiting frame from its position expected from the last trailing dot: a drift of one frame
 /// per batch, over the two batches for which it may wait.
 const DRIFT_FRAMES: i64 = 2;
@@ -135,7 +137,12 @@ struct Building {
 /// State of dividing the stream into batches.
 enum Cutter {
     /// Not started: the brightness of the trailing dot is still unknown.
-    Learning(Vec<Observation>),
+    Learning {
+        /// The frames so far.
+        run: Vec<Observation>,
+        /// Frames before them, among which there was no trailing dot, while others were lost.
+        given_up: u64,
+    },
     Cutting(Box<Synchroniser>),
     /// Impossible: the trailing dot was not seen.
     Blind,
@@ -168,12 +175,17 @@ pub(super) struct Gatherer<S> {
     ending: bool,
 }
 
+/// Whether exposures are missing between the frames.
+fn has_gaps(run: &[Observation]) -> bool {
+    run.windows(2).any(|pair| pair[1].id > pair[0].id + 1)
+}
+
 impl<S: CutSink> Gatherer<S> {
     pub fn new(scan: DotScan, format: PixelFormat, background: BackgroundMean, sink: S) -> Self {
         let shape = scan.shape;
         let learning = LEARNT_FROM_BATCHES * scan.dots as usize + 2;
         Self {
-            cutter: Cutter::Learning(Vec::with_capacity(learning)),
+            cutter: Cutter::Learning { run: Vec::with_capacity(learning), given_up: 0 },
             pending: VecDeque::with_capacity(2 * learning),
             kept: 0,
             most_kept: scan.frames_kept(),
@@ -220,10 +232,10 @@ impl<S: CutSink> Gatherer<S> {
         self.decided.clear();
         match &mut self.cutter {
             Cutter::Cutting(synchroniser) => self.decided.extend_from_slice(synchroniser.push(seen)),
-            Cutter::Learning(run) => {
+            Cutter::Learning { run, .. } => {
                 run.push(seen);
                 if run.len() > LEARNT_FROM_BATCHES * self.scan.dots as usize {
-                    self.begin_cutting()?;
+                    self.begin_cutting(true)?;
                 }
             }
             Cutter::Blind => {}
@@ -239,7 +251,7 @@ impl<S: CutSink> Gatherer<S> {
     pub fn finish(&mut self, spare: &mut dyn FnMut(SparseColumn)) -> Result<(), DotsError> {
         self.decided.clear();
         let learnt = match &self.cutter {
-            Cutter::Learning(run) if !run.is_empty() => self.begin_cutting(),
+            Cutter::Learning { run, .. } if !run.is_empty() => self.begin_cutting(false),
             _ => Ok(()),
         };
         self.settle_all(spare);
@@ -265,14 +277,29 @@ impl<S: CutSink> Gatherer<S> {
         std::mem::take(&mut self.background_changed).then(|| self.background.mean())
     }
 
-    fn begin_cutting(&mut self) -> Result<(), DotsError> {
-        let Cutter::Learning(run) = std::mem::replace(&mut self.cutter, Cutter::Blind) else { return Ok(()) };
-        let threshold = pulse_threshold(&run)?;
-        let mut synchroniser = Synchroniser::new(SyncSettings {
-            frames_per_batch: self.scan.dots,
-            trailing_index: self.scan.trailing_index,
-            threshold,
-        })?;
+    /// Ends the learning, or goes on with it if there was no trailing dot that could not have been lost; it cannot go on
+    /// unless there are `more` frames.
+    fn begin_cutting(&mut self, more: bool) -> Result<(), DotsError> {
+        let Cutter::Learning { mut run, mut given_up } = std::mem::replace(&mut self.cutter, Cutter::Blind)
+        else {
+            return Ok(());
+        };
+        let dots = self.scan.dots;
+        let most_given_up = MOST_GIVEN_UP_BATCHES * u64::from(dots);
+        let threshold = match pulse_threshold(&run) {
+            Err(DotsError::NoDot { .. }) if more && has_gaps(&run) && given_up < most_given_up => {
+                let fate = Fate::Unused(Cause::Unsynchronised);
+                let oldest = (given_up..).zip(run.drain(..dots as usize));
+                self.decided.extend(oldest.map(|(arrival, _)| Decided { arrival, fate }));
+                given_up += u64::from(dots);
+                self.cutter = Cutter::Learning { run, given_up };
+                return Ok(());
+            }
+            threshold => threshold?,
+        };
+        let settings =
+            SyncSettings { frames_per_batch: dots, trailing_index: self.scan.trailing_index, threshold };
+        let mut synchroniser = Synchroniser::new(settings)?.after(given_up);
         for seen in run {
             self.decided.extend_from_slice(synchroniser.push(seen));
         }

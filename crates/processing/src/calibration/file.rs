@@ -133,6 +133,10 @@ pub struct CalibratedLight {
     /// light; `None` if it was not measured, and the camera is taken as linear.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub linearity_per_dn: Option<Pair>,
+    /// Counts from which on a pixel is overexposed; `None` if it was not measured: then it is a share of the converter's
+    /// range.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub saturation_dn: Option<f64>,
     /// Number of pixels with unusual dark current or noise.
     pub hot_pixels: usize,
     /// Standard deviation of the width of a pixel's response, relative to itself; `None` in files of earlier versions,
@@ -423,6 +427,7 @@ impl KeptCalibration {
                 .light
                 .linearity_per_dn
                 .map(|[per_dn, _]| CameraCurve { per_dn, zero_dn: self.arrays.dark_offset_dn.clone() }),
+            saturation_dn: self.header.light.saturation_dn,
             noise: NoiseModel { read_variance: (read_noise_e[0] / white_e).powi(2), gain: white_e.recip() },
             strip,
             lamp: self.header.ambient.as_ref().and_then(CalibratedAmbient::lamp),
@@ -512,7 +517,7 @@ impl CalibrationHeader {
         Ok(Some(header))
     }
 
-    /// Checks that the rows and columns seen exist, and that the curve is one that is accepted.
+    /// Checks that the rows and columns seen exist, and that the curve and the counts that saturate are possible.
     fn check(&self) -> Result<(), String> {
         let columns = self.drawing.as_ref().and_then(|drawing| drawing.columns);
         if let Some(column) = columns.iter().flatten().find(|column| !(0.0..=1.0).contains(*column)) {
@@ -524,6 +529,9 @@ impl CalibrationHeader {
             return Err(format!(
                 "seen_rows = [{first}, {end}]: must be [first row, row after the last] of the {rows} projector rows"
             ));
+        }
+        if let Some(dn) = self.light.saturation_dn.filter(|dn| !(*dn > 0.0 && dn.is_finite())) {
+            return Err(format!("light.saturation_dn = {dn}: must be more than 0, in counts"));
         }
         match self.light.linearity_per_dn {
             Some([per_dn, sd]) if !(per_dn.abs() <= MOST_CURVE_PER_DN && sd >= 0.0) => Err(format!(

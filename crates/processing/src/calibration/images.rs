@@ -9,8 +9,8 @@ use raysweep_session::stack::{Stack, crc32};
 use raysweep_transport::plane::board::Estimate;
 use raysweep_transport::plane::board::images::{
     Ambient, BlackFrames, CappedFrames, CodedPictures, DarkFit, ImagesError, LightLevel, Linearity, Phases,
-    PhotonTransfer, Responses, RowPlaces, SensorNoise, WhiteMap, ambient, locate_columns, locate_rows,
-    photon_transfer, prnu, steady,
+    PhotonTransfer, Responses, RowPlaces, SaturationLimit, SensorNoise, WhiteMap, ambient, locate_columns,
+    locate_rows, photon_transfer, prnu, steady,
 };
 use raysweep_transport::plane::board::times::{
     BoardFrame, CoarseSweep, Columns, RollingSweep, RowTimes, TimesError,
@@ -29,6 +29,10 @@ const DARK_ROOM: f64 = 2e-5;
 const STEADY_SHARE: f64 = 0.001;
 /// A curve is not used if full scale is known no better than this, relative to itself.
 const KNOWN_BEND: f64 = 0.003;
+/// Where fewer pixels saturate, as a share of all, it is not known where the others do.
+const LEAST_SATURATED: f64 = 0.1;
+/// Share of the pixels that may saturate at fewer counts than what is taken for all.
+const SATURATED_BEFORE: f64 = 0.01;
 /// Fewer frames of an exposure do not show the room's light.
 const LEAST_AMBIENT_FRAMES: usize = 8;
 
@@ -222,6 +226,8 @@ pub struct BoardPixels {
     pub prnu: Estimate,
     /// The camera's curve.
     pub curve: MeasuredCurve,
+    /// Counts from which on a pixel is overexposed; `None` if no image fills enough pixels.
+    pub saturation_dn: Option<f64>,
     /// White, as all light in counts that are proportional to it.
     pub white: WhiteMap,
     /// The room's light, and the run whose clock its flicker has, or none if it was not looked for; `None` if too few
@@ -242,9 +248,10 @@ impl BoardPixels {
     /// When an image is missing, or board, light or pictures are of no use.
     pub fn new(images: &BoardImages<'_>) -> Result<Self, CalibrationError> {
         let task = images.task;
-        let saturation_dn = task.task.geometry.saturation_dn as f32;
         let dark = dark(images)?;
         let (black, white) = (images.frames(BoardPurpose::Black)?, images.frames(BoardPurpose::White)?);
+        let found_dn = saturation(images, &dark, &white)?;
+        let saturation_dn = found_dn.unwrap_or(f64::INFINITY).min(task.task.geometry.saturation_dn) as f32;
         let dark_dn = dark.image(WHOLE_US);
         let greys: Vec<(f64, Array3<f32>)> = CalibrationTask::greys()
             .map(|(light, purpose)| Ok((light, images.frames(purpose)?)))
@@ -293,7 +300,18 @@ impl BoardPixels {
         let responses = Responses::new(&phases, &white, &places, projector_rows)?;
         responses.checks.check()?;
         let columns = Columns::new(responses.place.view(), responses.response.view(), None)?;
-        Ok(Self { dark, transfer, prnu, curve, white, ambient, places, responses, columns })
+        Ok(Self {
+            dark,
+            transfer,
+            prnu,
+            curve,
+            saturation_dn: found_dn,
+            white,
+            ambient,
+            places,
+            responses,
+            columns,
+        })
     }
 
     /// The room's light in an image of a single frame, unless the room is dark.
@@ -480,6 +498,33 @@ fn room(
         true => Ok(Some((steady(&black_frames(&of_all), noise)?, looked))),
         false => Ok(None),
     }
+}
+
+/// Counts from which on a pixel is overexposed, if enough pixels saturate in more light than they can count: those of
+/// almost all pixels.
+fn saturation(
+    images: &BoardImages<'_>,
+    dark: &DarkFit,
+    white: &Array3<f32>,
+) -> Result<Option<f64>, CalibrationError> {
+    let saturated = images.frames(BoardPurpose::Saturated)?;
+    if saturated.is_empty() {
+        return Ok(None);
+    }
+    let geometry = &images.task.task.geometry;
+    let passes = f64::from(images.task.calibration.passes);
+    let (white_dark, saturated_dark) = (dark.image(WHOLE_US), dark.image(passes * geometry.raster.period_us));
+    let level = |light, frames, dark_dn| LightLevel { light, frames, dark_dn };
+    let ladder =
+        [level(1.0, white.view(), white_dark.view()), level(passes, saturated.view(), saturated_dark.view())];
+    let found = SaturationLimit::new(&ladder, geometry.saturation_dn as f32, dark.read_noise_dn.value)?;
+    if found.seen < LEAST_SATURATED {
+        return Ok(None);
+    }
+    let usable = found.limit_dn.iter().zip(&dark.hot).filter(|(_, hot)| !**hot);
+    let mut limits_dn: Vec<u16> = usable.map(|(limit_dn, _)| *limit_dn).collect();
+    limits_dn.sort_unstable();
+    Ok(limits_dn.get((SATURATED_BEFORE * limits_dn.len() as f64) as usize).map(|&dn| f64::from(dn)))
 }
 
 fn dark(images: &BoardImages<'_>) -> Result<DarkFit, CalibrationError> {

@@ -96,6 +96,7 @@ impl BoardFindings {
                 read_noise_e: pair(pixels.transfer.read_noise_e),
                 prnu: pair(pixels.prnu),
                 linearity_per_dn: pixels.curve.known().map(|linearity| pair(linearity.per_dn)),
+                saturation_dn: pixels.saturation_dn,
                 hot_pixels: pixels.dark.hot.iter().filter(|hot| **hot).count(),
                 response_width_sd: Some(pixels.responses.width_sd()),
             },

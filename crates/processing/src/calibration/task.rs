@@ -31,6 +31,8 @@ pub enum BoardPurpose {
     Grey(usize),
     /// The board under grey, in an exposure with this many passes of the beam: how linear the camera is.
     Passes(usize),
+    /// The board under white, in as long an exposure as the longest of those: where pixels saturate.
+    Saturated,
     /// The board under every 16th row, beginning with this one.
     Rows(usize),
     /// The board under a picture of the rows' Gray code: the highest bit first, each followed by its inverse.
@@ -60,6 +62,8 @@ const GREYS: [f32; 3] = [0.25, 0.5, 0.75];
 pub(super) const PASSES_GREY: f32 = 0.45;
 /// Frames of each number of passes.
 const PASSES_FRAMES: usize = 8;
+/// Frames in which pixels saturate.
+const SATURATED_FRAMES: usize = 4;
 /// Number of pictures of sparse rows, and the distance of their rows.
 const PHASES: usize = 16;
 /// Rows with the same Gray code.
@@ -100,8 +104,8 @@ impl CalibrationTask {
         Self::with_purposes(plan, calibration, known, purposes)
     }
 
-    /// The calibration of a session with these contents, which may be from before the columns were measured, the camera's
-    /// linearity or the room's light.
+    /// The calibration of a session with these contents, which may be from before it was measured where pixels saturate,
+    /// the columns, the camera's linearity or the room's light.
     pub fn stored(
         plan: &Plan,
         calibration: CalibrationPlan,
@@ -113,11 +117,17 @@ impl CalibrationTask {
             return task;
         }
         let before_passes = CalibrationPlan { passes: 0, ..calibration.clone() };
-        let earlier = [(calibration, true), (before_passes.clone(), true), (before_passes, false)];
-        let earlier = earlier.map(|(calibration, has_ambient)| {
+        let earlier = [
+            (calibration.clone(), true, true),
+            (calibration, false, true),
+            (before_passes.clone(), false, true),
+            (before_passes, false, false),
+        ];
+        let earlier = earlier.map(|(calibration, has_columns, has_ambient)| {
             let mut purposes = purposes(&calibration, known.file.projector.rows);
             purposes.retain(|purpose| match purpose {
-                BoardPurpose::ColumnCode(_) => false,
+                BoardPurpose::Saturated => false,
+                BoardPurpose::ColumnCode(_) => has_columns,
                 BoardPurpose::Ambient => has_ambient,
                 _ => true,
             });
@@ -150,6 +160,7 @@ impl CalibrationTask {
                 BoardPurpose::ExposureCheck => (1200.0, 1),
                 BoardPurpose::Ambient => (AMBIENT_US, 1),
                 BoardPurpose::Passes(passes) => (passes as f64 * raster.period_us, 1),
+                BoardPurpose::Saturated => (f64::from(calibration.passes) * raster.period_us, 1),
                 BoardPurpose::Black
                 | BoardPurpose::White
                 | BoardPurpose::Grey(_)
@@ -159,7 +170,9 @@ impl CalibrationTask {
             let delay_us = match purpose {
                 BoardPurpose::SweepTime | BoardPurpose::Arrival | BoardPurpose::ExposureCheck => 0.0,
                 // Half a period from the light at either end.
-                BoardPurpose::Passes(_) => lag_us + (exposure_us - raster.period_us) / 2.0,
+                BoardPurpose::Passes(_) | BoardPurpose::Saturated => {
+                    lag_us + (exposure_us - raster.period_us) / 2.0
+                }
                 _ => lag_us + WHOLE_US / 2.0 - BEFORE_LIGHT_US,
             };
             Point { role, delay_us, exposure_us, frames }
@@ -209,6 +222,7 @@ impl CalibrationTask {
                 block: COLUMNS_PER_BLOCK,
             },
             BoardPurpose::White
+            | BoardPurpose::Saturated
             | BoardPurpose::SweepTime
             | BoardPurpose::Arrival
             | BoardPurpose::ExposureCheck => Pattern::White,
@@ -372,12 +386,14 @@ fn purposes(plan: &CalibrationPlan, projector_rows: usize) -> Vec<BoardPurpose> 
     let greys = (0..GREYS.len()).flat_map(|grey| several(BoardPurpose::Grey(grey), GREY_FRAMES));
     let passes =
         (1..=plan.passes as usize).flat_map(|passes| several(BoardPurpose::Passes(passes), PASSES_FRAMES));
+    let saturated = several(BoardPurpose::Saturated, if plan.passes > 0 { SATURATED_FRAMES } else { 0 });
     let row_codes = 2 * row_bits(projector_rows) as usize;
     let column_codes = 2 * column_bits() as usize;
     capped
         .chain(levels.into_iter().flatten())
         .chain(greys)
         .chain(passes)
+        .chain(saturated)
         .chain((0..PHASES).map(BoardPurpose::Rows))
         .chain((0..row_codes).map(BoardPurpose::RowCode))
         .chain((0..column_codes).map(BoardPurpose::ColumnCode))

@@ -202,6 +202,12 @@ impl Synchroniser {
         })
     }
 
+    /// The same for a stream of which this many frames have been decided before.
+    #[must_use]
+    pub fn after(self, arrivals: u64) -> Self {
+        Self { arrivals, ..self }
+    }
+
     /// Takes the next frame and returns the frames whose fates have become certain.
     pub fn push(&mut self, seen: Observation) -> &[Decided] {
         self.decided.clear();

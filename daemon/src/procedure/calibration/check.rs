@@ -24,7 +24,7 @@ pub fn check(calibration: &CalibrationTask, lab: &Lab<'_>) -> Result<CheckReport
     for (ordinal, point) in (0..).zip(&task.schedule.points) {
         let shot = task.geometry.shot(point, lab.camera.trigger_latency_us);
         lab.camera.allows(&shot.settings).map_err(|message| match calibration.purpose(ordinal) {
-            BoardPurpose::Passes(_) => {
+            BoardPurpose::Passes(_) | BoardPurpose::Saturated => {
                 let passes = calibration.calibration.passes;
                 let cure = "take calibration.passes = 2, or 0: the camera is then taken as linear";
                 let message = format!("calibration.passes = {passes}: {message}; {cure}");

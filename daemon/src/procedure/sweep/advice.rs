@@ -131,6 +131,7 @@ mod tests {
             drawing: None,
             white_dn: Array2::from_elem((720, 16), 2500.0),
             curve: None,
+            saturation_dn: None,
             noise: NoiseModel { read_variance: 0.04, gain: 0.09 },
             strip: None,
             lamp: None,

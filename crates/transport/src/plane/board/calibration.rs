@@ -31,6 +31,8 @@ pub struct BoardCalibration {
     pub white_dn: Array2<f32>,
     /// The camera's curve; `None` for one that is taken as linear.
     pub curve: Option<CameraCurve>,
+    /// Counts from which on a pixel is overexposed; `None` if it was not measured.
+    pub saturation_dn: Option<f64>,
     /// Noise of one frame, in shares of white.
     pub noise: NoiseModel,
     /// Where the board stays in view during runs, if it does.
