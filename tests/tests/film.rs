@@ -326,10 +326,10 @@ fn check_says_how_many_transports_a_second_the_camera_allows() {
     assert_eq!((film.settings, film.cycles, film.periods_per_cycle), (15, 240, 15));
     assert!((film.transports_per_s - 4.0).abs() < 0.001);
     assert_eq!((free.points, free.extra_points, free.frames), (240, 1, 240 * 15 + 32));
-    // Per pixel: 15 frames of 2 bytes, and 4 bytes per row of the transport.
+    // Per pixel: 15 frames of 2 bytes, and per row of the transport 4 bytes and 1 of the mask.
     let (first_row, last_row) = free.reach_rows.unwrap();
     let reach = f64::from(last_row - first_row + 1);
-    let minute = 240.0 * (ROWS * COLUMNS) as f64 * (30.0 + 4.0 * reach);
+    let minute = 240.0 * (ROWS * COLUMNS) as f64 * (30.0 + 5.0 * reach);
     assert!((film.disk_bytes_per_minute as f64 / minute - 1.0).abs() < 0.001);
     let held = check("[sim.camera]\nreadout = \"overlapped\"\nreadout_us = 16_100\n").film.unwrap();
     assert_eq!(held.periods_per_cycle, 15, "downwards no trigger is missed");

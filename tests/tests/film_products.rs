@@ -136,14 +136,18 @@ fn videos_show_the_pictures_at_the_pace_of_the_cycles() {
 #[test]
 fn products_asked_for_later_have_the_bits_of_those_in_the_plan() {
     let (planned, late) = (bench(), bench());
-    let planned = complete(&planned, &with_products(&PRODUCTS[..3], &plan(6)));
-    let late = complete(&late, &plan(6));
+    let judged = r#"kind = "uncertainty", from_rows = 0, to_rows = 0, name = "sd""#;
+    let planned = complete(&planned, &with_products(&[&PRODUCTS[..3], &[judged]].concat(), &plan(8)));
+    let late = complete(&late, &plan(8));
     assert!(made(&late).is_empty(), "a film without products has none");
-    let products = PRODUCTS[1..3].iter().map(|&product| product.to_owned()).collect();
+    let products = PRODUCTS[1..3].iter().chain([&judged]).map(|&product| product.to_owned()).collect();
     let asked = Asked { products, only: true, ..Asked::default() };
     process_asked(&late.session, &asked).unwrap();
-    for name in ["indirect", "below"] {
+    for name in ["indirect", "below", "sd"] {
         assert_eq!(video(&late.session, name), video(&planned.session, name));
+        let mask =
+            |ended: &Ended| std::fs::read(ended.session.join(format!("products/{name}_mask.npy"))).unwrap();
+        assert!(mask(&late) == mask(&planned));
     }
     assert!(!late.session.join("products/epipolar.npy").exists());
     assert!(manifest::verify(&Session::open(&late.session).unwrap()).unwrap().is_empty());
@@ -157,6 +161,7 @@ fn what_a_film_cannot_show_is_refused_before_anything_moves() {
         (r#"kind = "delay-profile", pixel = [3, 3]"#, "a film's products are"),
         (r#"kind = "relight", line = { height_rows = 2, step_rows = 3 }"#, "use rows or stripes"),
         (r#"kind = "epipolar", width_rows = 2"#, "odd"),
+        (r#"kind = "uncertainty", from_rows = 0"#, "film.cycles = 2"),
     ] {
         let refused = bench.runner.check(&with_products(&[product], &plan(2))).unwrap_err();
         assert!(refused.message.contains(part), "{product}: {}", refused.message);
@@ -189,7 +194,9 @@ fn cycles_scatter_as_their_uncertainty_says() {
         r#"kind = "uncertainty", stripes = { period_rows = 16, lit_rows = 6 }, name = "striped-sd""#,
     ];
     let ended = complete(&bench, &with_products(&products, &plan(40)));
-    assert!(video(&ended.session, "direct-bias").iter().all(|bound| bound.is_finite() && *bound >= 0.0));
+    let bounds = video(&ended.session, "direct-bias");
+    let positive = bounds.iter().filter(|bound| bound.is_finite() && **bound > 0.0).count();
+    assert!(10 * positive > 9 * bounds.len(), "{positive} of {}", bounds.len());
     for name in ["direct", "striped"] {
         let [light, sd] = ["", "-sd"].map(|end| video(&ended.session, &format!("{name}{end}")));
 

@@ -206,21 +206,25 @@ impl FilmSolver {
 
     /// The stack from which the transport of a cycle was solved, for its products; the number of cycles solved before it
     /// decides how. Of a solver that has learned: its noise, and whether near rows are one band, are also those of the
-    /// cycles from which it has learned.
+    /// cycles from which it has learned. What only [`crate::ProductSpec::needs_noise`] products ask for is made if it `is_judged`.
     ///
     /// # Errors
     /// As [`Self::solve`].
     pub fn solved_stack(
         &self,
-        cycles_before: usize,
+        (cycles_before, is_judged): (usize, bool),
         frames: &[(Setting, Arc<Array2<f32>>)],
         dark: &Array2<f32>,
     ) -> Result<SweepStack, NotSolved> {
         let learned = self.learned.as_ref();
         let choices = learned.filter(|_| cycles_before >= FIRST_CYCLES).unwrap_or(&self.planned);
         let mut stack = self.stack(frames, dark);
-        choices.prepare(&(0..self.geometry.height), 0, &mut stack, &|| true).map_err(not_solved)?;
-        stack.noise = learned.and_then(Choices::noise);
+        if is_judged {
+            choices.prepare(&(0..self.geometry.height), 0, &mut stack, &|| true).map_err(not_solved)?;
+            stack.noise = learned.and_then(Choices::noise_without_darks);
+        } else {
+            stack.timing = choices.timing().clone();
+        }
         stack.one_band = learned.is_some_and(|learned| learned.findings.one_band);
         Ok(stack)
     }

@@ -59,6 +59,8 @@ pub struct Choices {
     /// What is not known of the calibration, after the run has refined it.
     calibration: Option<CalibrationCovariance>,
     noise: Option<NoiseModel>,
+    /// The same without that of the dark images.
+    noise_without_darks: Option<NoiseModel>,
     coupling: Option<Coupling>,
     /// The reasons for the choices.
     pub findings: Findings,
@@ -144,8 +146,12 @@ pub fn choose(
     };
     // A spot that cannot be modelled is told here.
     cut.modelled_by(demux.with_settings(settings)?)?;
+    let ratios = frames_of(&stack).into_iter().zip(&stack.dark_frames);
+    let ratio =
+        ratios.map(|(frames, &dark)| frames as f64 / dark as f64).sum::<f64>() / stack.settings.len() as f64;
+    let noise_without_darks = noise.map(|noise| noise.without_darks(ratio));
     let geometry = geometry.clone();
-    Ok(Choices { demux, geometry, late_us, calibration, noise, coupling, findings })
+    Ok(Choices { demux, geometry, late_us, calibration, noise, noise_without_darks, coupling, findings })
 }
 
 impl Findings {
@@ -224,8 +230,9 @@ impl Choices {
             demux,
             geometry: geometry.clone(),
             late_us: 0.0,
-            calibration: None,
+            calibration: geometry.calibration.as_ref().map(|calibration| calibration.covariance),
             noise: None,
+            noise_without_darks: None,
             coupling: None,
         }
     }
@@ -265,9 +272,14 @@ impl Choices {
         Ok(self)
     }
 
-    /// The noise of a single frame, if it could be fitted.
-    pub(crate) fn noise(&self) -> Option<NoiseModel> {
-        self.noise
+    /// The noise of a single frame without that of its dark image, if it could be fitted.
+    pub(crate) fn noise_without_darks(&self) -> Option<NoiseModel> {
+        self.noise_without_darks
+    }
+
+    /// The timing of the model.
+    pub(crate) fn timing(&self) -> &RowTiming {
+        self.demux.timing()
     }
 
     /// Number of additional rows that the stack must contain on either side of those solved, where the image has
@@ -339,7 +351,7 @@ impl Choices {
         }
         stack.timing = self.demux.timing().clone();
         stack.prior = self.demux.prior();
-        stack.noise = self.noise;
+        stack.noise = self.noise_without_darks;
         stack.calibration = self.calibration;
         stack.one_band = self.findings.one_band;
         stack.u0_rows = self.demux.u0_rows().map(|u0_rows| u0_rows.slice(s![rows.clone(), ..]).to_owned());

@@ -34,7 +34,7 @@ pub struct SweepStack {
     pub regular_valid: Option<Array2<bool>>,
     /// Which pixels a stage replaced in some image, `[t, s]`; `None` if none.
     pub filled: Option<Array2<bool>>,
-    /// The noise of a single frame, if it could be fitted.
+    /// The noise of a single frame without that of its dark image, if it could be fitted.
     pub noise: Option<NoiseModel>,
     /// Share of the noise variance that remains after spatial coupling, `[t, s]`; `None` if not coupled.
     pub variance_ratio: Option<Array2<f32>>,

@@ -9,7 +9,7 @@
 //!
 //! One shard is one cycle, so that a cycle costs one fsync of a file and one of a folder for each array. A cycle without
 //! a line in the ledger is not stored, whatever `film` contains; in `transport`, a cycle that was not estimated is NaN,
-//! and its mask is 0.
+//! whatever its mask.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

@@ -88,7 +88,7 @@ impl DarkRun {
     ) -> Result<Sensor, DotsError> {
         if self.taken < self.wanted {
             let (given, needed) = (self.taken as usize, self.wanted as usize);
-            let what = "dark frames: the camera was stopped before it had taken them";
+            let what = "dark frames: the camera was stopped, lost them or saw light in them";
             return Err(DotsError::TooFew { what, given, needed });
         }
         let mut repaired = self.statistics.hot_pixels(hot_sigmas)?;

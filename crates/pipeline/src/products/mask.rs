@@ -38,6 +38,17 @@ pub fn of_transport(transport: &Transport, rows: Range<usize>) -> Array3<u8> {
             *bits = *bits & !MEASURED | BOUND_ONLY;
         }
     }
+    // Nothing is known of a pixel whose samples do not count, and which is dark: a calibration has not measured it.
+    for (t, row) in rows.enumerate() {
+        let is_unmeasured = |s: &usize| {
+            transport.saturated[[row, *s]]
+                && !transport.lower_bounds.contains_key(&[row, *s])
+                && transport.t.slice(s![.., row, *s]).iter().all(|light| *light == 0.0)
+        };
+        for s in (0..columns).filter(is_unmeasured) {
+            bits.slice_mut(s![.., t, s]).mapv_inplace(|bits| bits & OUTSIDE_REACH);
+        }
+    }
     bits
 }
 
@@ -45,18 +56,20 @@ pub fn of_transport(transport: &Transport, rows: Range<usize>) -> Array3<u8> {
 /// those some of whose light is only a bound.
 pub fn stored_transport(t: Array3<f32>, u_min: i32, bits: ArrayView3<'_, u8>) -> Transport {
     let (depth, rows, columns) = t.dim();
-    let has = |pixel: [usize; 2], bit: u8| {
-        bits.slice(s![.., pixel[0], pixel[1]]).iter().map(|bits| bits & bit != 0).collect::<Vec<bool>>()
-    };
-    let pixels = (0..rows).flat_map(|t| (0..columns).map(move |s| [t, s]));
-    let lower_bounds: BTreeMap<[usize; 2], Vec<bool>> = pixels
-        .map(|pixel| (pixel, has(pixel, BOUND_ONLY)))
-        .filter(|(_, bounds)| bounds.contains(&true))
-        .collect();
+    let mut no_edge = Array2::from_elem((rows, columns), false);
+    let mut lower_bounds = BTreeMap::<[usize; 2], Vec<bool>>::new();
+    for ((u, t, s), bits) in bits.indexed_iter() {
+        if bits & BOUND_ONLY != 0 {
+            lower_bounds.entry([t, s]).or_insert_with(|| vec![false; depth])[u] = true;
+        }
+        no_edge[[t, s]] |= bits & NO_EDGE != 0;
+    }
     Transport {
-        exists: Array2::from_shape_fn((depth, rows), |(u, t)| bits[[u, t, 0]] & OUTSIDE_REACH == 0),
+        exists: Array2::from_shape_fn((depth, rows), |(u, t)| {
+            bits.slice(s![u, t, ..]).iter().all(|bits| bits & OUTSIDE_REACH == 0)
+        }),
         saturated: Array2::from_shape_fn((rows, columns), |(t, s)| lower_bounds.contains_key(&[t, s])),
-        no_edge: Array2::from_shape_fn((rows, columns), |(t, s)| has([t, s], NO_EDGE).contains(&true)),
+        no_edge,
         t,
         u_min,
         lower_bounds,
@@ -101,4 +114,36 @@ pub(super) fn of(
         .into_iter()
         .fold(0, |mask, (is_set, bit)| if is_set { mask | bit } else { mask })
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_known_of_a_transport_is_read_back() {
+        let t = Array3::from_shape_fn(
+            (9, 4, 5),
+            |(u, t, s)| if (t, s) == (1, 1) { 0.0 } else { (u + t + s + 1) as f32 },
+        );
+        let exists = Array2::from_shape_fn((9, 4), |(u, t)| u + t >= 2);
+        let mut transport = Transport::measured(t, -4, exists);
+        for pixel in [[0, 3], [3, 0], [1, 1]] {
+            transport.saturated[pixel] = true;
+        }
+        transport.lower_bounds.insert([0, 3], (0..9).map(|u| u == 4).collect());
+        transport.lower_bounds.insert([3, 0], (0..9).map(|u| u > 5).collect());
+        transport.no_edge[[2, 2]] = true;
+        let bits = of_transport(&transport, 0..4);
+        assert_eq!(
+            (bits[[4, 0, 3]], bits[[3, 0, 3]], bits[[0, 0, 0]]),
+            (BOUND_ONLY, MEASURED, OUTSIDE_REACH)
+        );
+        assert_eq!((bits[[4, 2, 2]], bits[[1, 2, 2]]), (MEASURED | NO_EDGE, MEASURED));
+        assert_eq!((bits[[4, 1, 1]], bits[[0, 1, 1]]), (0, OUTSIDE_REACH), "nothing is known of it");
+        assert_eq!(of_transport(&transport, 2..4), bits.slice(s![.., 2.., ..]));
+        let back = stored_transport(transport.t.clone(), -4, bits.view());
+        transport.saturated[[1, 1]] = false;
+        assert_eq!(back, transport);
+    }
 }

@@ -152,6 +152,11 @@ impl ProductSpec {
         Some(format!("product {}: {what}", self.name))
     }
 
+    /// Whether it judges the light of another product, for which the noise must be known.
+    pub fn needs_noise(&self) -> bool {
+        matches!(self.kind, ProductKind::Uncertainty(_) | ProductKind::PriorBias(_))
+    }
+
     /// Why it cannot be made of a film's cycles, if it cannot.
     pub fn not_of_a_film(&self) -> Option<String> {
         let what = match &self.kind {

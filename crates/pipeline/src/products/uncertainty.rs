@@ -121,7 +121,6 @@ fn image(
     make: impl FnOnce(&Uncertainty<'_>, &Samples<'_>) -> Result<Array3<f32>, PlaneError>,
 ) -> Result<Array2<f32>, String> {
     let frames: Vec<usize> = stack.settings.iter().map(|setting| setting.delays_us.len()).collect();
-    let ratios = frames.iter().zip(&stack.dark_frames).map(|(&frames, &dark)| frames as f64 / dark as f64);
     let samples = Samples {
         stack: stack.images.view(),
         valid: stack.valid.as_ref().map(|valid| valid.view()),
@@ -132,8 +131,7 @@ fn image(
         timing: &stack.timing,
         settings: &stack.settings,
         prior: stack.prior,
-        // The stack from which the noise was fitted contains that of the dark images.
-        noise: noise.without_darks(ratios.sum::<f64>() / frames.len() as f64),
+        noise,
         frames: &frames,
         delay_sds_us: &stack.delay_sds_us,
         darks: &stack.darks(),

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use ndarray::{Array2, Axis};
+use ndarray::{Array2, Axis, Zip};
 use raysweep_core::{Counts, SettingsId};
 use raysweep_pipeline::{Point, Stages, Unit, run_stages};
 use raysweep_session::film::{CycleEntry, Film, crc32};
@@ -68,7 +68,10 @@ impl<'a> StoredFrames<'a> {
         let frames = settings.map(|((raw, point), &delay_us)| {
             let unit = unit(point, entry, delay_us, raw.mapv(u32::from));
             let image = run_stages(self.stages, &unit).map_err(|error| format!("cycle {cycle}: {error}"))?;
-            filled.zip_mut_with(&(&raw.mapv(f32::from) - &image), |filled, change| *filled |= *change != 0.0);
+            Zip::from(&mut filled)
+                .and(&raw)
+                .and(&image)
+                .for_each(|filled, &raw, &image| *filled |= f32::from(raw) != image);
             Ok((Setting::new(delay_us, entry.exposure_us), Arc::new(image)))
         });
         let frames = frames.collect::<std::result::Result<_, String>>()?;

@@ -32,6 +32,8 @@ pub fn process(stored: &Stored<'_>, film: FilmPlan, asked: &Asked) -> Result<Pro
     let mut problems = make_transports(session, &task, &mut state, &stages)?;
     let state = &state;
     let mut products = write_products(session, state, &task, &stages, &specs, &is_wanted, &|| true)?;
+    // What stands in the way of the transports stands in that of the products.
+    products.problems.retain(|problem| !problems.contains(problem));
     problems.append(&mut products.problems);
     report::write(session, state, &task, &products, &problems)?;
     manifest::write(session, state, &task.task, &rig)?;
@@ -56,7 +58,7 @@ fn products(
     for argument in &asked.products {
         let before = specs.len();
         append_argument(&mut specs, argument, &task.task).map_err(ProcessError::Product)?;
-        let refused = |spec: &ProductSpec| spec.not_of_a_film().or_else(|| spec.beyond(reach_rows));
+        let refused = |spec: &ProductSpec| task.cannot_make(spec).or_else(|| spec.beyond(reach_rows));
         if let Some(what) = specs[before..].iter().find_map(refused) {
             return Err(ProcessError::Product(format!("--product {argument}: {what}")));
         }

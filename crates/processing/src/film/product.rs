@@ -66,13 +66,14 @@ pub fn write_products(
         return Ok(made);
     }
     source.learn(&cycles);
+    let is_judged = specs.iter().any(ProductSpec::needs_noise);
     let mut drafts: Vec<Draft<'_>> =
         specs.iter().map(|spec| Draft::new(spec, is_wanted(spec.name()))).collect();
     for number in 0..cycles.len() {
         if !go_on() {
             return Ok(made);
         }
-        let (stack, transport) = match source.cycle(number, cycles[number])? {
+        let (stack, transport) = match source.cycle((number, is_judged), cycles[number])? {
             Ok(cycle) => cycle,
             Err(problem) => {
                 made.problems.push(format!("{problem}, so no product is made"));
@@ -81,6 +82,9 @@ pub fn write_products(
         };
         let mut sound = Vec::new();
         for mut draft in drafts {
+            if !go_on() {
+                return Ok(made);
+            }
             match draft.spec.make(&stack, &transport) {
                 Ok(Product::Image { about, image, mask, .. }) => {
                     draft.append(session, task, &cycles, number, (image, mask), about)?;
@@ -154,7 +158,7 @@ impl<'a> Source<'a> {
     /// The stack and the transport of a cycle, the one of this number among those that have one; or what is wrong with it.
     fn cycle(
         &self,
-        number: usize,
+        (number, is_judged): (usize, bool),
         entry: &CycleEntry,
     ) -> Result<std::result::Result<(SweepStack, Transport), String>> {
         let cycle = entry.cycle;
@@ -162,7 +166,7 @@ impl<'a> Source<'a> {
             return Ok(Err(format!("the transport of cycle {cycle} is gone")));
         };
         let stack = self.frames.read(entry).and_then(|StoredCycle { frames, filled }| {
-            let stack = self.solver.solved_stack(number, &frames, &self.frames.dark);
+            let stack = self.solver.solved_stack((number, is_judged), &frames, &self.frames.dark);
             let stack = stack.map_err(|error| format!("cycle {cycle}: {error}"))?;
             Ok(SweepStack { filled: Some(filled), ..stack })
         });

@@ -67,11 +67,25 @@ impl FilmTask {
     pub fn products(&self) -> std::result::Result<Vec<ProductSpec>, ConfigError> {
         let specs = planned_products(&self.products, &self.task)?;
         for (index, spec) in specs.iter().enumerate() {
-            if let Some(what) = spec.not_of_a_film() {
+            if let Some(what) = self.cannot_make(spec) {
                 return Err(self.task.refuse(&["product", &index.to_string(), "kind"], what));
             }
         }
         Ok(specs)
+    }
+
+    /// Why a product cannot be made of this film, if it cannot.
+    pub(super) fn cannot_make(&self, spec: &ProductSpec) -> Option<String> {
+        let is_short = self.points() < FilmSolver::FIRST_CYCLES && spec.needs_noise();
+        let short = is_short.then(|| {
+            format!(
+                "product {}: film.cycles = {}: must be at least {}, whose mean shows the noise",
+                spec.name(),
+                self.points(),
+                FilmSolver::FIRST_CYCLES
+            )
+        });
+        spec.not_of_a_film().or(short)
     }
 
     /// The solver that computes the transport of each cycle.

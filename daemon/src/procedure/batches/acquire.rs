@@ -201,7 +201,9 @@ impl DotPasses<'_> {
         let has_enough = AtomicBool::new(false);
         let rounds = task.batches.dark_rounds(wanted);
         for _ in 0..MOST_DARK_PASSES {
+            let mut arrived = 0;
             let lost = self.player.play(&path, rounds, wanted.into(), &has_enough, &mut |arrival| {
+                arrived += 1;
                 // Some more frames arrive while waiting for the camera's last one.
                 if !has_enough.load(Ordering::Relaxed) {
                     let unpacked = task.format.unpack_into(&arrival.frame.data, &mut counts);
@@ -221,7 +223,8 @@ impl DotPasses<'_> {
                 Ok(())
             })?;
             frames += lost.iter().map(|loss| loss.frames).sum::<u64>();
-            let is_over = failed.is_some() || has_enough.load(Ordering::Relaxed);
+            // More frames would not help if as many as are wanted were of no use.
+            let is_over = failed.is_some() || has_enough.load(Ordering::Relaxed) || arrived >= wanted;
             // A recording has no more frames.
             if is_over || self.player.is_recorded() || !self.orders.go_on() {
                 break;

@@ -14,8 +14,9 @@ use crate::procedure::lab::Lab;
 /// Disk space of the report and other small files, in bytes.
 const OTHER_BYTES: u64 = 10_000_000;
 
-/// Disk space of a pixel of a product's image: float32 in its array and its EXR file, 8 bits in its picture and video.
-const BYTES_PER_PRODUCT_PIXEL: u64 = 4 + 4 + 1 + 1;
+/// Disk space of a pixel of a product's image: float32 in its array and its EXR file, 8 bits in its picture and video; its
+/// mask in an array of 8 bits and as float32 in the EXR file.
+const BYTES_PER_PRODUCT_PIXEL: u64 = 4 + 4 + 1 + 1 + 1 + 4;
 
 /// Predicts a film.
 ///
@@ -65,7 +66,7 @@ fn of_cycles(film: &FilmTask, camera: &CameraCapabilities, reach_rows: u64) -> F
     let periods = order.cycle_periods();
     let transports_per_s = 1e6 / (f64::from(periods) * geometry.raster.period_us);
     let pixels = (geometry.height * geometry.width) as f64;
-    let bytes_per_cycle = pixels * (2.0 * settings as f64 + 4.0 * reach_rows as f64);
+    let bytes_per_cycle = pixels * (2.0 * settings as f64 + 5.0 * reach_rows as f64);
     let missed = periods.saturating_sub(settings as u32);
     let readout_us = camera.readout_us;
     let reason = match (missed, camera.readout) {

@@ -65,8 +65,13 @@ impl BiasOfFamily {
     pub(in super::super) fn bound(&self, weight: impl Fn(i32) -> f64) -> Result<BiasBound, PlaneError> {
         let all: f64 = (-self.projector_rows..=self.projector_rows).map(&weight).sum();
         let total = |solved: &SolvedFamily| solved.weights(&weight).sum();
-        let best =
-            self.solved.iter().max_by(|a, b| total(a).total_cmp(&total(b))).ok_or(PlaneError::NotConvex)?;
+        // Of equals the first: `max_by` takes the last.
+        let best = self
+            .solved
+            .iter()
+            .rev()
+            .max_by(|a, b| total(a).total_cmp(&total(b)))
+            .ok_or(PlaneError::NotConvex)?;
         if total(best) > 0.0 {
             return best.bound(&self.prior, best.weights(&weight));
         }

@@ -488,7 +488,9 @@ impl Demux {
             let (own, exact) = (Array1::from(own), Array1::from(exact));
             let solved = minimise_censored(self.simd, problem, &self.prior, own.view(), exact.view())?;
             minima.row_mut(k).assign(&solved);
-            if let Some(bounds) = self.lower_bounds(problem, exact.view()) {
+            // A pixel that was not calibrated has no light at all, not even a bound.
+            let is_lit = own.iter().zip(&exact).any(|(&sample, is_exact)| !is_exact && sample > 0.0);
+            if let Some(bounds) = self.lower_bounds(problem, exact.view()).filter(|_| is_lit) {
                 rows[at].data.bounds.push((column, bounds));
             }
         }
