@@ -222,7 +222,13 @@ fn what_saturates_is_marked_in_each_cycle() {
     let sim = format!("scene = \"mix\"\nscene_rows = {ROWS}\nscene_columns = {COLUMNS}\nseed = 3");
     // Counts end below what the brightest pixels send.
     let bench = Bench::new(&rig_text(720, &sim, "[sim.truth]\nwhite_dn = 7000\n"));
-    let products = [r#"kind = "epipolar""#, r#"kind = "band", from_rows = 5, to_rows = 9, name = "beside""#];
+    let products = [
+        r#"kind = "epipolar""#,
+        r#"kind = "band", from_rows = 5, to_rows = 9, name = "beside""#,
+        // Far above all rows that the camera looks at, and farther than the film reaches.
+        r#"kind = "relight", rows = [{ first = 300, last = 310 }], name = "above""#,
+        r#"kind = "relight", rows = [{ first = 0, last = 3 }], name = "beyond""#,
+    ];
     let ended = complete(&bench, &with_products(&products, &plan(6)));
     let (session, _) = ended.open();
     let film = TransportFilm::open(&session.transport_film_path()).unwrap();
@@ -242,6 +248,8 @@ fn what_saturates_is_marked_in_each_cycle() {
             assert_eq!(beside[[t, s]] & mask::BOUND_ONLY != 0, any);
         }
     }
+    assert!(mask("above").iter().all(|bits| *bits == mask::MEASURED), "no row that saturates is lit");
+    assert!(mask("beyond").iter().all(|bits| *bits == mask::MEASURED | mask::OUTSIDE_REACH));
     let names = metadata(&ended.session, "epipolar")["mask"].clone();
     assert_eq!(names["bound only"], mask::BOUND_ONLY);
     let picture = std::fs::read(ended.session.join("products/epipolar/0000.exr")).unwrap();

@@ -116,10 +116,6 @@ impl Cycle {
     }
 }
 
-/// Cycles from whose mean a film learns: enough for single frames' noise and jitter, and no more than wait for a solver
-/// at a time, so that a film processed again learns from the same cycles.
-const FIRST_CYCLES: usize = 4;
-
 /// Computes a cycle's light transport from its frames.
 pub struct FilmSolver {
     options: DemuxOptions,
@@ -149,6 +145,10 @@ struct FirstCycles {
 }
 
 impl FilmSolver {
+    /// Cycles from whose mean a film learns: enough for single frames' noise and jitter, and no more than wait for a
+    /// solver at a time, so that a film processed again learns from the same cycles.
+    pub const FIRST_CYCLES: usize = 4;
+
     /// A solver for the cycles of `schedule`.
     ///
     /// # Errors
@@ -217,7 +217,7 @@ impl FilmSolver {
         dark: &Array2<f32>,
     ) -> Result<SweepStack, NotSolved> {
         let learned = self.learned.as_ref();
-        let choices = learned.filter(|_| cycles_before >= FIRST_CYCLES).unwrap_or(&self.planned);
+        let choices = learned.filter(|_| cycles_before >= Self::FIRST_CYCLES).unwrap_or(&self.planned);
         let mut stack = self.stack(frames, dark);
         if is_judged {
             choices.prepare(&(0..self.geometry.height), 0, &mut stack, &|| true).map_err(not_solved)?;
@@ -228,9 +228,6 @@ impl FilmSolver {
         stack.one_band = learned.is_some_and(|learned| learned.findings.one_band);
         Ok(stack)
     }
-
-    /// Number of cycles from which it learns.
-    pub const FIRST_CYCLES: usize = FIRST_CYCLES;
 
     /// Takes the frames of another complete cycle, as for [`Self::solve`]. Once it has the first few, it chooses from
     /// their mean how to demultiplex the cycles after them, as a sweep does from its images, and returns what it found.
@@ -245,7 +242,7 @@ impl FilmSolver {
     ) -> Option<Result<&Findings, NotSolved>> {
         let mut first = self.first.take()?;
         first.add(self.stack(frames, dark));
-        if first.cycles < FIRST_CYCLES {
+        if first.cycles < Self::FIRST_CYCLES {
             self.first = Some(first);
             return None;
         }

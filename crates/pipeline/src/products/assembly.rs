@@ -67,7 +67,8 @@ impl Assembly {
     ) -> Result<(), NotMade> {
         let name = self.spec.name.clone();
         let not_made = |what: String| NotMade { name: self.spec.name.clone(), what };
-        let mask = mask::of(&self.spec.kind, first_row, stack, transport);
+        let mask = mask::of(&self.spec.kind, first_row, stack, transport)
+            .map_err(|error| not_made(error.to_string()))?;
         let part = match &self.spec.kind {
             ProductKind::Regular => match &stack.regular {
                 Some(image) => Product::Image {

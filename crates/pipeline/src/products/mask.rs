@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::ops::{Range, RangeInclusive};
 
 use ndarray::{Array2, Array3, ArrayView3, Axis, s};
-use raysweep_transport::plane::Transport;
+use raysweep_transport::plane::{PlaneError, Transport};
 
 use super::spec::ProductKind;
 use crate::stack::SweepStack;
@@ -83,7 +83,8 @@ pub(super) fn of(
     first_row: usize,
     stack: &SweepStack,
     transport: &Transport,
-) -> Array2<u8> {
+) -> Result<Array2<u8>, PlaneError> {
+    let relit = kind.relit().map(|relit| relit.unknowns(&stack.timing, first_row, transport)).transpose()?;
     let (_, height, width) = transport.t.dim();
     let rows = kind.rows();
     let is_lit = |u: i32| rows.iter().any(|rows| rows.contains(&u));
@@ -96,14 +97,18 @@ pub(super) fn of(
     let measured =
         stack.valid.as_ref().map(|valid| valid.map_axis(Axis(0), |valid| valid.iter().any(|v| *v)));
     let at = |map: &Option<Array2<bool>>, pixel, absent| map.as_ref().map_or(absent, |map| map[pixel]);
-    Array2::from_shape_fn((height, width), |pixel| {
+    Ok(Array2::from_shape_fn((height, width), |pixel| {
         let (t, s) = pixel;
-        let is_bound = match kind {
-            ProductKind::Regular => !at(&stack.regular_valid, pixel, true),
+        let is_bound = match (kind, &relit) {
+            (ProductKind::Regular, _) => !at(&stack.regular_valid, pixel, true),
+            (_, Some(relit)) => relit.is_bound[pixel],
             _ => rows.iter().any(|rows| transport.is_bound([t, s], rows.clone())),
         };
         let beyond = [transport.u_min - 1, transport.u_max() + 1];
-        let is_outside = beyond.iter().any(|&u| asked(u) && stack.timing.row_exists(u, first_row + t));
+        let is_outside = match &relit {
+            Some(relit) => relit.is_beyond[pixel],
+            None => beyond.iter().any(|&u| asked(u) && stack.timing.row_exists(u, first_row + t)),
+        };
         [
             (at(&measured, pixel, true) && !is_bound, MEASURED),
             (is_bound, BOUND_ONLY),
@@ -113,7 +118,7 @@ pub(super) fn of(
         ]
         .into_iter()
         .fold(0, |mask, (is_set, bit)| if is_set { mask | bit } else { mask })
-    })
+    }))
 }
 
 #[cfg(test)]

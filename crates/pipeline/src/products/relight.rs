@@ -1,7 +1,7 @@
 //! Product `relight`: the scene lit by a pattern of projector rows.
 
 use ndarray::{Array1, Array2, Array3, Axis};
-use raysweep_transport::plane::{PlaneError, RelitBeam, RowTiming, Transport, relight_rows};
+use raysweep_transport::plane::{PlaneError, RelitBeam, RelitUnknowns, RowTiming, Transport, relight_rows};
 use serde::Deserialize;
 
 use super::band::reach_of;
@@ -207,6 +207,24 @@ impl Relight {
             }
             RowPattern::Line(line) => Err(*line),
         }
+    }
+
+    /// What is not known of its light; of a sequence, of the light of any image.
+    pub(super) fn unknowns(
+        &self,
+        timing: &RowTiming,
+        first_row: usize,
+        transport: &Transport,
+    ) -> Result<RelitUnknowns, PlaneError> {
+        let weights = self.weights(timing.projector_rows()).map_or_else(
+            |line| {
+                let tops = line.first_rows(timing);
+                let lit = |row: usize| tops.iter().any(|top| (*top..top + line.height_rows).contains(&row));
+                Array1::from_shape_fn(timing.projector_rows(), |row| f64::from(u8::from(lit(row))))
+            },
+            |(_, weights)| weights,
+        );
+        RelitUnknowns::of(timing, first_row, transport, weights.view(), self.beam)
     }
 
     pub(super) fn beam(&self) -> RelitBeam {

@@ -46,6 +46,16 @@ pub(super) enum ProductKind {
 }
 
 impl ProductKind {
+    /// The relit image that it is, or whose light it judges.
+    pub(super) fn relit(&self) -> Option<&Relight> {
+        match self {
+            Self::Relight(relight)
+            | Self::Uncertainty(LightOf::Relit(relight))
+            | Self::PriorBias(LightOf::Relit(relight)) => Some(relight),
+            _ => None,
+        }
+    }
+
     /// The relative rows whose light it tells apart; `i32::MIN` and `i32::MAX`: as far as the sweep reaches.
     pub(super) fn rows(&self) -> Vec<RangeInclusive<i32>> {
         match self {

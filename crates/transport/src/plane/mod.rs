@@ -39,7 +39,7 @@ pub use model::{
 };
 pub use noise::{Coupled, Coupling, NoiseModel};
 pub use products::{
-    DarkImage, DelayProfile, LightSums, RelitBeam, Samples, Uncertainty, relight, relight_rows,
+    DarkImage, DelayProfile, LightSums, RelitBeam, RelitUnknowns, Samples, Uncertainty, relight, relight_rows,
 };
 #[doc(hidden)]
 pub use solve::linear;

@@ -6,5 +6,5 @@ mod sensitivity;
 mod uncertainty;
 
 pub use profile::DelayProfile;
-pub use relight::{RelitBeam, relight, relight_rows};
+pub use relight::{RelitBeam, RelitUnknowns, relight, relight_rows};
 pub use uncertainty::{DarkImage, LightSums, Samples, Uncertainty};

@@ -66,6 +66,54 @@ pub fn relight_rows(
     Ok(image)
 }
 
+/// What is not known of the light of a relit image.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RelitUnknowns {
+    /// Pixels `[t, s]` some of whose lit rows are only a lower bound.
+    pub is_bound: Array2<bool>,
+    /// Those some of whose lit rows lie beyond the transport's reach, so that their light is missing.
+    pub is_beyond: Array2<bool>,
+}
+
+/// Rows with a smaller share of the largest weight are not counted as lit: the tails of a beam.
+const LEAST_WEIGHT: f64 = 1e-3;
+
+impl RelitUnknowns {
+    /// Those of [`relight_rows`] with the same arguments.
+    ///
+    /// # Errors
+    /// As [`relight_rows`].
+    pub fn of(
+        timing: &RowTiming,
+        first_row: usize,
+        transport: &Transport,
+        weights: ArrayView1<f64>,
+        beam: RelitBeam,
+    ) -> Result<Self, PlaneError> {
+        let (_, rows, columns) = transport.t.dim();
+        let lit = LitRows::new(timing, columns, weights, beam)?;
+        let least = LEAST_WEIGHT * lit.weights.iter().fold(0.0, |most: f64, weight| most.max(*weight));
+        let known = transport.u_min..=transport.u_max();
+        let mut is_bound = Array2::from_elem((rows, columns), false);
+        let mut is_beyond = is_bound.clone();
+        for at in 0..rows {
+            for class in lit.classes(first_row + at) {
+                let rows_of = 0..timing.projector_rows() as i64;
+                let lit_rows =
+                    rows_of.map(|v| (v - class.own_row) as i32).filter(|&u| class.weight(u) > least);
+                let (within, beyond): (Vec<i32>, Vec<i32>) = lit_rows.partition(|u| known.contains(u));
+                for &column in &class.columns {
+                    let bounds = transport.lower_bounds.get(&[at, column]);
+                    is_bound[[at, column]] = bounds
+                        .is_some_and(|bounds| within.iter().any(|u| bounds[(u - transport.u_min) as usize]));
+                    is_beyond[[at, column]] = !beyond.is_empty();
+                }
+            }
+        }
+        Ok(Self { is_bound, is_beyond })
+    }
+}
+
 /// A projector's rows, lit with one weight each.
 pub(super) struct LitRows<'a> {
     timing: &'a RowTiming,
@@ -212,6 +260,21 @@ mod tests {
         assert_eq!(part, whole.slice(s![1..3, ..]));
         let beyond = relight_rows(&timing, 3, &rows, weights.view(), RelitBeam::default());
         assert_eq!(beyond.unwrap_err(), PlaneError::Rows { row: 4, camera_rows: 4 });
+    }
+
+    #[test]
+    fn unknown_light_counts_only_where_it_is_lit() {
+        let (timing, mut transport) = scene();
+        // The light of projector row 4 in the pixel in row 1, whose own row is 3.
+        transport.lower_bounds.insert([1, 2], vec![false, false, false, true, false]);
+        for v in 0..8_usize {
+            let weights = Array1::from_shape_fn(8, |row| if row == v { 0.5 } else { 0.0 });
+            let found = RelitUnknowns::of(&timing, 0, &transport, weights.view(), RelitBeam::Ideal).unwrap();
+            for ((t, s), &is_bound) in found.is_bound.indexed_iter() {
+                assert_eq!(is_bound, (v, t, s) == (4, 1, 2), "row {v} at ({t}, {s})");
+                assert_eq!(found.is_beyond[[t, s]], v.abs_diff(2 + t) > 2, "row {v} at ({t}, {s})");
+            }
+        }
     }
 
     #[test]
