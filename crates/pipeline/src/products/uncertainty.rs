@@ -63,7 +63,7 @@ impl LightOf {
             None => "noise and dark images",
         };
         let about = format!(
-            "standard deviation, through {of}, of {says}; without the prior's bias, which the product prior-bias shows"
+            "standard deviation, through {of}, of {says}; without the prior's bias, which the product prior-bias bounds"
         );
         Ok(Product::Image { name, about, image, mask })
     }
