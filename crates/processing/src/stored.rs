@@ -19,7 +19,7 @@ pub enum ProcessError {
     Session(#[from] raysweep_session::Error),
     /// Something of it is damaged.
     #[error(
-        "{} is damaged, so nothing was made, and its results are as they were:{}\n{}`raysweep resume` acquires damaged points again, a backup may have the files, and --accept-damage goes on without what is damaged",
+        "{} is damaged, so nothing was made, and its results are as they were:{}\n{}`raysweep resume` acquires damaged points again (not those of films and batches, whose moment is over), a backup may have the files, and --accept-damage goes on without what is damaged",
         dir.display(), listed(damage), if *is_edited { EDITED } else { "" }
     )]
     Damaged {

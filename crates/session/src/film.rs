@@ -126,13 +126,23 @@ impl TransportFilm {
     /// Opens the series at `dir`.
     ///
     /// # Errors
-    /// [`Error::Zarr`] if it is missing or damaged.
+    /// [`Error::Zarr`] if it is missing or damaged; [`Error::Shape`] if the masks are not as large as the transports.
     pub fn open(dir: &Path) -> Result<Self> {
         let transport = CycleArray::open_array(dir, &transport_layout(1))?;
         let layout = mask_layout(1);
         let has_mask = dir.join(layout.name).exists();
         let mask = has_mask.then(|| CycleArray::open_array(dir, &layout)).transpose()?;
-        Ok(Self { transport, mask })
+        let opened = Self { transport, mask };
+        match &opened.mask {
+            Some(mask) if zarr::shape_of(&mask.array) != zarr::shape_of(&opened.transport.array) => {
+                Err(Error::Shape {
+                    what: mask.path.display().to_string(),
+                    found: zarr::shape_of(&mask.array),
+                    allowed: format!("{:?}, as the transport has", zarr::shape_of(&opened.transport.array)),
+                })
+            }
+            _ => Ok(opened),
+        }
     }
 
     /// The attributes that it was created with.
@@ -382,6 +392,13 @@ mod tests {
         assert_eq!(opened.read(0).unwrap(), None);
         TransportFilm::create(&path, 2, [7, 9, 70], &attributes, &bits).unwrap();
         assert_eq!(opened.read(1).unwrap(), None);
+
+        let other = dir.path().join("other.zarr");
+        TransportFilm::create(&other, 2, [7, 9, 71], &attributes, &bits).unwrap();
+        std::fs::remove_dir_all(path.join("mask")).unwrap();
+        assert!(TransportFilm::open(&path).unwrap().read(1).unwrap().is_none(), "as in earlier versions");
+        std::fs::rename(other.join("mask"), path.join("mask")).unwrap();
+        assert!(matches!(TransportFilm::open(&path), Err(Error::Shape { .. })));
     }
 
     #[test]

@@ -138,6 +138,9 @@ fn header(header: &CalibrationHeader) -> String {
     }
     let [_, latency_sd] = rounded([0.0, header.timing.latency_sd_us]);
     let _ = write!(text, "{:NAME_WIDTH$} known to {latency_sd} us", "latency");
+    if let Some(dn) = header.light.saturation_dn {
+        let _ = write!(text, "\n{:NAME_WIDTH$} {dn:.0}", "pixels saturate from / DN");
+    }
     for (name, said) in header.ambient.iter().flat_map(CalibratedAmbient::lines) {
         let _ = write!(text, "\n{name:NAME_WIDTH$} {said}");
     }

@@ -447,7 +447,7 @@ pub(super) fn audit(audit: &Audit, stored: usize, points: usize) -> String {
             let what = if damage.iter().all(Damage::is_of_results_only) {
                 "results alone: `raysweep process` makes them again"
             } else {
-                "`raysweep resume` acquires damaged points again, a backup may have the files, and `raysweep process --accept-damage` goes on without what is damaged"
+                "`raysweep resume` acquires damaged points again (not those of films and batches, whose moment is over), a backup may have the files, and `raysweep process --accept-damage` goes on without what is damaged"
             };
             format!("{count} damaged: {what}")
         }

@@ -80,13 +80,14 @@ fn found(findings: &BoardFindings) -> Block {
         let millionths = Estimate { value: value * 1e6, sd: sd * 1e6 };
         ("curve of the camera: a of DN (1 + a DN) / 10⁻⁶", millionths, 2)
     });
-    let saturation =
-        pixels.saturation_dn.map(|value| ("pixels saturate from / DN", Estimate { value, sd: 0.0 }, 0));
-    let rows =
-        rows.into_iter().chain(curve).chain(saturation).map(|(name, Estimate { value, sd }, digits)| {
-            vec![name.to_owned(), format!("{value:.digits$}"), format!("{sd:.digits$}")]
-        });
-    Block::Table(Table { headers: ["", "value", "± 1 sd"].map(Into::into).to_vec(), rows: rows.collect() })
+    let rows = rows.into_iter().chain(curve).map(|(name, Estimate { value, sd }, digits)| {
+        vec![name.to_owned(), format!("{value:.digits$}"), format!("{sd:.digits$}")]
+    });
+    let saturation = pixels
+        .saturation_dn
+        .map(|dn| vec!["pixels saturate from / DN".to_owned(), format!("{dn:.0}"), String::new()]);
+    let rows = rows.chain(saturation).collect();
+    Block::Table(Table { headers: ["", "value", "± 1 sd"].map(Into::into).to_vec(), rows })
 }
 
 /// The room's light, if it was measured.

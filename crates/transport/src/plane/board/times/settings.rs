@@ -53,6 +53,8 @@ pub struct Nominal {
 
 /// Rows on either side of an edge within which the beam blurs it.
 pub(super) const BEAM_ROWS: f64 = 4.0;
+/// Fewest rows from which the times of a sweep are found.
+const LEAST_SEEN: usize = 64;
 /// Exposure of the rolling frames that find arrivals, in row times.
 const ARRIVAL_ROWS: f64 = 3.0;
 /// How far the delays of the arrival step extend beyond the range of arrivals, in row times.
@@ -102,11 +104,18 @@ impl Nominal {
 /// close after the last, and 16 exposures that open and close while they are lit.
 ///
 /// # Errors
-/// Those of [`Nominal::check`]; [`PlaneError::Window`] if fewer than 64 rows are seen, or rows that do not exist.
+/// Those of [`Nominal::check`]; [`PlaneError::OutOfRange`] if fewer than 64 rows are seen, [`PlaneError::Window`] for
+/// rows that do not exist.
 pub fn sweep_settings(nominal: &Nominal, seen_rows: Range<usize>) -> Result<Vec<BoardSetting>, PlaneError> {
     nominal.check()?;
     let Nominal { projector_rows, row_time_us, period_us, .. } = *nominal;
-    if seen_rows.len() < 64 || seen_rows.end > projector_rows {
+    if seen_rows.len() < LEAST_SEEN {
+        let (field, value) = ("number of projector rows that the image sees", seen_rows.len() as f64);
+        let allowed =
+            "at least 64 for a calibration: take more camera rows, or let the image see more of the board";
+        return Err(PlaneError::OutOfRange { field, value, allowed });
+    }
+    if seen_rows.end > projector_rows {
         return Err(PlaneError::Window { first_row: seen_rows.start, end: seen_rows.end, projector_rows });
     }
     let start_us = nominal.start_us(seen_rows.start as f64);
