@@ -10,7 +10,7 @@ use super::foresee::{Noise, Pixels};
 const DRAWS: u64 = 4;
 /// Share of the family's pixels within the bound: more than the 95 % that it is meant for, because scenes differ more
 /// from the family than its pixels from each other.
-const WITHIN: f64 = 0.98;
+const WITHIN: f64 = 0.99;
 
 /// How far estimates of sums of the family's light are from the truth, beside what the prior is seen to do to them.
 #[derive(Debug)]

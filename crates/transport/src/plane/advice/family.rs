@@ -65,9 +65,9 @@ impl FamilyPixel {
 
 /// The transports over which errors are predicted: pixels of [`SCENES`] scenes, the same at every call.
 ///
-/// A scene is a printed or painted opaque surface with bodies on it. Scenes differ in the share of pixels that show
-/// a translucent body (none to all), in how far light spreads inside it, and in how strongly surfaces light each
-/// other. The ranges are those of everyday matter under a projector of some hundred rows; none is fitted to a
+/// A scene is a printed or painted opaque surface with bodies on it. Scenes differ in brightness and contrast, in the
+/// share of pixels that show a translucent body (none to all), in how much of its light spreads inside and how far, and
+/// in how strongly surfaces light each other. The ranges are those of everyday matter under a projector of some hundred rows; none is fitted to a
 /// rendered scene.
 pub(super) fn family() -> Vec<Vec<FamilyPixel>> {
     (0..SCENES).map(scene).collect()
@@ -78,11 +78,14 @@ fn scene(index: usize) -> Vec<FamilyPixel> {
     let translucent = (index as f64 / (SCENES - 1) as f64 * 4.0 / 3.0 - 1.0 / 3.0).max(0.0);
     let mut random = Random::new(index as u64);
     let (length_rows, reflectance) = (random.log_uniform(1.0, 5.0), random.log_uniform(0.03, 0.3));
+    let brightness = random.log_uniform(0.3, 1.0);
+    let darkest = random.uniform(0.4, 0.8);
+    let body_spread = random.uniform(0.4, 1.2).min(1.0);
     (0..PIXELS_PER_SCENE)
         .map(|pixel| {
             let is_translucent = (pixel as f64 + 0.5) / (PIXELS_PER_SCENE as f64) < translucent;
-            let albedo = random.log_uniform(0.1, 0.9);
-            let spread = if is_translucent { random.uniform(0.4, 0.7) } else { 0.0 };
+            let albedo = brightness * random.log_uniform(darkest, 0.9);
+            let spread = if is_translucent { body_spread } else { 0.0 };
             let near = random.uniform(0.5, 0.8);
             let exponential = |share: f64, rows: f64, skew: f64| Exponential {
                 light: albedo * spread * share,

@@ -157,7 +157,7 @@ impl Uncertainty<'_> {
     /// itself shows, and of the pixel's whole light.
     ///
     /// The estimate does not show how rough the truth is, so the multiples are taken from transports that are known,
-    /// those of `family`, which is that of the same model. The bound holds for 98 % of them and is meant for 95 % of the
+    /// those of `family`, which is that of the same model. The bound holds for 99 % of them and is meant for 95 % of the
     /// pixels of other scenes.
     ///
     /// # Errors
