@@ -222,6 +222,8 @@ fn check_ranges(config: &SimConfig) -> Result<(), SimError> {
         ("ambient.flicker_hz", config.ambient.flicker_hz, "more than 0"),
         ("board.scatter_rows", config.board.scatter_rows, "0 to 100"),
         ("board.scatter_share", config.board.scatter_share, share),
+        ("board.second_scatter_rows", config.board.second_scatter_rows, "0 to 100"),
+        ("board.second_scatter_share", config.board.second_scatter_share, share),
         ("board.projector_columns", config.board.projector_columns[0], share),
         ("board.projector_columns", config.board.projector_columns[1], share),
         ("truth.first_row_us", truth.first_row_us.unwrap_or(0.0), not_negative),

@@ -13,6 +13,7 @@ pub struct ShownOptics {
     scene: Prepared,
     /// The board alone.
     board: Prepared,
+    second_board: Prepared,
 }
 
 /// A subject under a pattern, with the position of the projector's lens that it was computed for.
@@ -21,13 +22,15 @@ struct Prepared(RwLock<Option<(f64, Arc<[RasterOptics]>)>>);
 
 impl ShownOptics {
     pub fn new(pattern: Pattern) -> Self {
-        Self { pattern, scene: Prepared::default(), board: Prepared::default() }
+        let [scene, board, second_board] = std::array::from_fn(|_| Prepared::default());
+        Self { pattern, scene, board, second_board }
     }
 
     fn of(&self, subject: Subject) -> Option<&Prepared> {
         match subject {
             Subject::Scene => Some(&self.scene),
             Subject::Board => Some(&self.board),
+            Subject::SecondBoard => Some(&self.second_board),
             Subject::Cap | Subject::Plane(_) | Subject::Diffuser => None,
         }
     }

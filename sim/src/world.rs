@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use raysweep_config::sim::{FlickerPhase, SimConfig};
+use raysweep_config::sim::{FlickerPhase, SimBoard, SimConfig};
 use raysweep_core::{CameraCapabilities, Pattern, PixelFormat, Raster, Shutter, Subject, ns_from_us};
 
 use crate::error::SimError;
@@ -84,6 +84,15 @@ impl PlaneWorld {
                 self.scenes.iter().map(optics).collect::<Result<Arc<[RasterOptics]>, SimError>>()?
             }
             Subject::Board => [RasterOptics::of_board(&config.board, &view, &shown.pattern)?].into(),
+            Subject::SecondBoard => {
+                let SimBoard { second_scatter_rows, second_scatter_share, .. } = config.board;
+                let board = SimBoard {
+                    scatter_rows: second_scatter_rows,
+                    scatter_share: second_scatter_share,
+                    ..config.board
+                };
+                [RasterOptics::of_board(&board, &view, &shown.pattern)?].into()
+            }
             Subject::Cap | Subject::Plane(_) | Subject::Diffuser => return Ok(()),
         };
         shown.keep(subject, lens_mm, optics);

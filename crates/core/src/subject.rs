@@ -16,6 +16,8 @@ pub enum Subject {
     Diffuser,
     /// The flat, matt, white board of a plane rig's calibration, in the scene's place.
     Board,
+    /// Another such board in the same place, of another material.
+    SecondBoard,
     /// A cap on the lens of a plane rig's camera: no light at all.
     Cap,
 }
@@ -28,6 +30,7 @@ impl fmt::Display for Subject {
             Self::Plane(plane) => write!(f, "calibration plane {}", plane + 1),
             Self::Diffuser => write!(f, "a diffuser"),
             Self::Board => write!(f, "the white board"),
+            Self::SecondBoard => write!(f, "the second white board"),
             Self::Cap => write!(f, "the lens cap"),
         }
     }

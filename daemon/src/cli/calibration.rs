@@ -132,12 +132,18 @@ fn header(header: &CalibrationHeader) -> String {
     if let Some(drawing) = &header.drawing {
         text += &format!("rows       {}\n", drawing.text());
     }
+    if let Some(of) = header.light.response_of {
+        text += &format!("responses  {}\n", of.text());
+    }
     for (name, pair) in figures(header) {
         // Writing to a string does not fail.
         let _ = writeln!(text, "{name:NAME_WIDTH$} {}", with_error(pair));
     }
     let [_, latency_sd] = rounded([0.0, header.timing.latency_sd_us]);
     let _ = write!(text, "{:NAME_WIDTH$} known to {latency_sd} us", "latency");
+    if let Some(sd) = header.light.response_width_sd {
+        let _ = write!(text, "\n{:NAME_WIDTH$} known to {:.1} %", "width of the responses", 100.0 * sd);
+    }
     if let Some(dn) = header.light.saturation_dn {
         let _ = write!(text, "\n{:NAME_WIDTH$} {dn:.0}", "pixels saturate from / DN");
     }

@@ -110,6 +110,9 @@ pub fn place(
             Subject::Plane(_) => format!("put {subject} of {planes} in front of the camera"),
             Subject::Scene => "put the scene in front of the camera and remove everything else".into(),
             Subject::Board => "put the white board in the scene's place, so that it fills the view".into(),
+            Subject::SecondBoard => {
+                "put the second white board, of another material, in the place of the first".into()
+            }
             Subject::Cap => "put the cap on the camera's lens".into(),
         };
         ask(&text, orders, board);

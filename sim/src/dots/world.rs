@@ -196,7 +196,7 @@ impl World {
                 );
                 return Err(not_there(what));
             }
-            Subject::Board | Subject::Cap => {
+            Subject::Board | Subject::SecondBoard | Subject::Cap => {
                 let what = format!("{subject}: a dot rig has the scene, planes and a diffuser");
                 return Err(not_there(what));
             }
@@ -354,7 +354,7 @@ impl World {
     fn still(&self, subject: Subject, rate_hz: f64, scan: &MirrorScan, batch: u64) -> Arc<dyn Still> {
         let plane = match subject {
             Subject::Plane(number) => self.bench.scene.plane(number),
-            Subject::Scene | Subject::Diffuser | Subject::Board | Subject::Cap => None,
+            Subject::Scene | Subject::Diffuser | Subject::Board | Subject::SecondBoard | Subject::Cap => None,
         };
         plane.unwrap_or_else(|| {
             let seconds = (batch * scan.samples_per_batch()) as f64 / rate_hz;

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use ndarray::{Array2, Array3, ArrayView3, Axis, s};
 use raysweep::rig::Rig;
-use raysweep_processing::calibration::{KeptCalibration, Scanning};
+use raysweep_processing::calibration::{KeptCalibration, ResponseOf, Scanning};
 use raysweep_session::film::TransportFilm;
 use raysweep_sim::PlaneRig;
 use raysweep_tests::{Bench, Ended, rig_text};
@@ -111,8 +111,12 @@ const MOST: f64 = 1.15;
 
 /// A rig of which only the calibration tells: its bench, the simulator, and the calibration that is in use.
 fn calibrated(scene: &Path, more: &str) -> (Bench, Rig, KeptCalibration) {
+    calibrated_by("kind = \"calibration\"\n", scene, more)
+}
+
+fn calibrated_by(plan: &str, scene: &Path, more: &str) -> (Bench, Rig, KeptCalibration) {
     let (bench, rig) = bench(scene, more);
-    let calibration = bench.run("kind = \"calibration\"\n");
+    let calibration = bench.run(plan);
     assert_eq!(calibration.state, "complete", "{:?}", calibration.error);
     let found = KeptCalibration::read(&calibration.session).unwrap().unwrap();
     (bench, rig, found)
@@ -170,6 +174,24 @@ fn a_flying_spot_is_found_by_the_calibration() {
         );
         assert!(worst_us < 1.5 + 0.05 * ROW_TIME_US);
         assert!(known < 0.035 && calibrated < MOST * known);
+    }
+}
+
+/// The first board spreads all of its light over some rows, the second none.
+#[test]
+fn a_second_board_tells_the_beam_from_the_board() {
+    let scene = raysweep_tests::data("p2r_corner.npz");
+    for scatter_rows in [0.3, 0.7] {
+        let board = format!("[sim.board]\nscatter_rows = {scatter_rows}\nscatter_share = 1.0\n");
+        let unknown = UNKNOWN.replace("JITTER", "0.5") + &board;
+        let (alone, rig, found) = calibrated(&scene, &unknown);
+        assert_eq!(found.header.light.response_of, Some(ResponseOf::BeamAndBoard));
+        let misled = error_of_sweep(&alone.run(SWEEP), rig.simulated().unwrap());
+        let rig = calibrated_by("kind = \"calibration\"\n[calibration]\nboards = 2\n", &scene, &unknown);
+        assert_eq!(rig.2.header.light.response_of, Some(ResponseOf::Beam));
+        let [(told, known)] = found_and_known(&rig, |bench, sim| [error_of_sweep(&bench.run(SWEEP), sim)]);
+        println!("{scatter_rows} rows: {misled:.4} by one board, {told:.4} by two, {known:.4} known");
+        assert!(told < MOST * known && misled > told);
     }
 }
 

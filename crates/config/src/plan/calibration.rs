@@ -15,6 +15,9 @@ pub struct CalibrationPlan {
     pub frames: u32,
     /// Frames averaged of each picture of sparse rows.
     pub picture_frames: u32,
+    /// Boards that are shown, 1 or 2: a second one of another material tells the beam from light that spreads inside a
+    /// board.
+    pub boards: u32,
     /// Largest number of passes of the beam in the exposures that show how linear the camera is; 0: none are taken.
     pub passes: u32,
     /// Delays at which the arrival of each row's light is measured: once over all at which it may come, twice over those
@@ -30,6 +33,7 @@ impl Default for CalibrationPlan {
             exposure_us: Axis::List(vec![60.0, 600.0, 1200.0, 3600.0]),
             frames: 16,
             picture_frames: 4,
+            boards: 1,
             passes: 3,
             delays: 64,
             max_jitter_us: 100.0,
@@ -62,6 +66,7 @@ impl CalibrationPlan {
         }
         document.check_count(&["calibration", "frames"], self.frames.into(), 4..=1024);
         document.check_count(&["calibration", "picture_frames"], self.picture_frames.into(), 1..=1024);
+        document.check_count(&["calibration", "boards"], self.boards.into(), 1..=2);
         if self.passes == 1 || self.passes > MOST_PASSES {
             let message = format!(
                 "calibration.passes = {}: must be 2 to {MOST_PASSES}, or 0 for a camera that cannot be exposed for two VSYNC periods",

@@ -333,6 +333,10 @@ pub struct SimBoard {
     pub scatter_rows: f64,
     /// Share of the board's light that spreads inside it, 0..=1.
     pub scatter_share: f64,
+    /// The same of the second board, which a calibration with two boards compares it with.
+    pub second_scatter_rows: f64,
+    /// The same of the second board.
+    pub second_scatter_share: f64,
     /// Projector columns, 0 to 1 across its width, that the image's left and right edges see on the board.
     pub projector_columns: [f64; 2],
     /// First column of the scene's images in which the board stays in view, and the column after the last.
@@ -341,7 +345,14 @@ pub struct SimBoard {
 
 impl Default for SimBoard {
     fn default() -> Self {
-        Self { scatter_rows: 0.0, scatter_share: 0.0, projector_columns: [0.0, 1.0], strip_columns: None }
+        Self {
+            scatter_rows: 0.0,
+            scatter_share: 0.0,
+            second_scatter_rows: 0.0,
+            second_scatter_share: 0.0,
+            projector_columns: [0.0, 1.0],
+            strip_columns: None,
+        }
     }
 }
 

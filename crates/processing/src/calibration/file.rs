@@ -143,6 +143,32 @@ pub struct CalibratedLight {
     /// which take it as exact.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub response_width_sd: Option<f64>,
+    /// Whose responses these are; `None` in files of earlier versions, which are of beam and board.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub response_of: Option<ResponseOf>,
+}
+
+/// What the responses of a calibration contain.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum ResponseOf {
+    /// Of one board, which spreads light inside as a wider beam would.
+    #[serde(rename = "beam and board")]
+    BeamAndBoard,
+    /// Of the narrower one of two boards of different material.
+    #[serde(rename = "beam")]
+    Beam,
+}
+
+impl ResponseOf {
+    /// For an operator.
+    pub fn text(self) -> &'static str {
+        match self {
+            Self::BeamAndBoard => {
+                "of beam and board, which one board cannot tell apart (calibration.boards = 2)"
+            }
+            Self::Beam => "of the beam, by two boards",
+        }
+    }
 }
 
 /// The room's light.

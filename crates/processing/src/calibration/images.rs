@@ -9,8 +9,8 @@ use raysweep_session::stack::{Stack, crc32};
 use raysweep_transport::plane::board::Estimate;
 use raysweep_transport::plane::board::images::{
     Ambient, BlackFrames, CappedFrames, CodedPictures, DarkFit, ImagesError, LightLevel, Linearity, Phases,
-    PhotonTransfer, Responses, RowPlaces, SaturationLimit, SensorNoise, WhiteMap, ambient, locate_columns,
-    locate_rows, photon_transfer, prnu, steady,
+    PhotonTransfer, ResponseComparison, Responses, RowPlaces, SaturationLimit, SensorNoise, WhiteMap,
+    ambient, compare_responses, locate_columns, locate_rows, photon_transfer, prnu, steady,
 };
 use raysweep_transport::plane::board::times::{
     BoardFrame, CoarseSweep, Columns, RollingSweep, RowTimes, TimesError,
@@ -18,11 +18,15 @@ use raysweep_transport::plane::board::times::{
 use raysweep_transport::plane::calibrate::FlyingSpot;
 use raysweep_transport::plane::{NoiseModel, PlaneError};
 
+use super::file::median;
 use super::task::{
-    AMBIENT_US, BoardPurpose, COLUMNS_PER_BLOCK, CalibrationTask, PASSES_GREY, ROWS_PER_BLOCK, WHOLE_US,
+    AMBIENT_US, BoardPicture, BoardPurpose, COLUMNS_PER_BLOCK, CalibrationTask, PASSES_GREY, ROWS_PER_BLOCK,
+    WHOLE_US, WhichBoard,
 };
 use crate::plane::place;
 
+/// A second board whose pixels look at rows farther from those of the first stands elsewhere.
+const MOST_AWAY_ROWS: f64 = 0.05;
 /// Light of the room, of white in the time of a row, that is not worth subtracting.
 const DARK_ROOM: f64 = 2e-5;
 /// Flicker by less than this share of a pass of the beam does not bend the curve.
@@ -42,6 +46,22 @@ pub enum CalibrationError {
     /// The board, its light or its pictures.
     #[error(transparent)]
     Images(#[from] ImagesError),
+    /// The second board, its light or its pictures.
+    #[error("the second board: {0}")]
+    SecondBoard(ImagesError),
+    /// The second board stands elsewhere than the first.
+    #[error(
+        "the second board: its pixels look at rows that are {away_rows:.2} rows from those of the first, and at most {MOST_AWAY_ROWS} are allowed: put it exactly in the place of the first"
+    )]
+    Elsewhere {
+        /// The median distance.
+        away_rows: f64,
+    },
+    /// The room's light is not the same in the pictures of both boards.
+    #[error(
+        "the second board: the room's light flickers, and what is left of it in the pictures looks like light that a board spreads: switch the lamps off for a calibration with two boards"
+    )]
+    Lamps,
     /// The times.
     #[error(transparent)]
     Times(#[from] TimesError),
@@ -206,6 +226,24 @@ impl BoardImages<'_> {
         frames.into_iter().max_by_key(|(run, count)| (*count, *run)).map(|(run, _)| run)
     }
 
+    /// The black and the white frames of a board.
+    fn black_and_white(&self, board: WhichBoard) -> Result<[Array3<f32>; 2], CalibrationError> {
+        let frames = |picture| self.frames(BoardPurpose::Response(board, picture));
+        Ok([frames(BoardPicture::Black)?, frames(BoardPicture::White)?])
+    }
+
+    /// The pictures of a board that tell rows apart, with `straight` as the camera's curve.
+    fn rows(
+        &self,
+        board: WhichBoard,
+        black: &Array3<f32>,
+        straight: impl Fn(Array3<f32>) -> Array3<f32>,
+    ) -> Result<RowPictures, CalibrationError> {
+        let black_dn = black.mean_axis(Axis(0)).unwrap_or_default();
+        let sparse = straight(self.means(CalibrationTask::phases(board))?) - &black_dn;
+        Ok(RowPictures { sparse, coded: self.means(self.task.row_codes(board))? })
+    }
+
     /// Means of several purposes, `[n, t, s]` in counts.
     fn means(&self, purposes: impl Iterator<Item = BoardPurpose>) -> Result<Array3<f32>, CalibrationError> {
         let images: Vec<Array2<f32>> = purposes
@@ -214,6 +252,37 @@ impl BoardImages<'_> {
         let views: Vec<_> = images.iter().map(|image| image.view()).collect();
         ndarray::stack(Axis(0), &views).map_err(|error| CalibrationError::Image(error.to_string()))
     }
+}
+
+/// Mean pictures of a board, `[n, t, s]` in counts: those of sparse rows above black, and those of the rows' Gray code.
+struct RowPictures {
+    sparse: Array3<f32>,
+    coded: Array3<f32>,
+}
+
+impl RowPictures {
+    /// Where each pixel of the board looks, and how it responds.
+    fn responses(
+        &self,
+        task: &CalibrationTask,
+        white: &WhiteMap,
+    ) -> Result<(RowPlaces, Responses), ImagesError> {
+        let projector_rows = task.task.geometry.raster.rows;
+        let phases = Phases { images: self.sparse.view(), frames: task.calibration.picture_frames as usize };
+        let code = CodedPictures { images: self.coded.view(), lines_per_block: ROWS_PER_BLOCK };
+        let places = locate_rows(&phases, &code, white.lit().view(), projector_rows)?;
+        let responses = Responses::new(&phases, white, &places, projector_rows)?;
+        responses.checks.check()?;
+        Ok((places, responses))
+    }
+}
+
+/// What the images of the second board say.
+pub struct SecondBoard {
+    /// Place and response.
+    pub responses: Responses,
+    /// Its responses against those of the first.
+    pub comparison: ResponseComparison,
 }
 
 /// What the images say of each pixel.
@@ -249,7 +318,7 @@ impl BoardPixels {
     pub fn new(images: &BoardImages<'_>) -> Result<Self, CalibrationError> {
         let task = images.task;
         let dark = dark(images)?;
-        let (black, white) = (images.frames(BoardPurpose::Black)?, images.frames(BoardPurpose::White)?);
+        let [black, white] = images.black_and_white(WhichBoard::First)?;
         let found_dn = saturation(images, &dark, &white)?;
         let saturation_dn = found_dn.unwrap_or(f64::INFINITY).min(task.task.geometry.saturation_dn) as f32;
         let dark_dn = dark.image(WHOLE_US);
@@ -275,8 +344,7 @@ impl BoardPixels {
             true if task.calibration.passes > 0 => MeasuredCurve::Uncertain,
             _ => MeasuredCurve::of(images, &dark, saturation_dn)?,
         };
-        let straight = |images| curve.straightened(images, &dark);
-        let (black, white) = (straight(black), straight(white));
+        let [black, white] = [black, white].map(|frames| curve.straightened(frames, &dark));
         let white = WhiteMap {
             saturated: counted.saturated,
             ..WhiteMap::new(white.view(), black.view(), saturation_dn, noise)?
@@ -288,17 +356,9 @@ impl BoardPixels {
         if let Some((ambient, _)) = &ambient {
             ambient.check(white.level_dn.value, task.task.geometry.raster.row_time_us)?;
         }
-        let lit = white.lit();
-        let prnu = prnu(white.white_dn.view(), Some(lit.view()), frames, noise)?;
-        let black_dn = black.mean_axis(Axis(0)).unwrap_or_default();
-        let sparse = straight(images.means(CalibrationTask::phases())?) - &black_dn;
-        let phases = Phases { images: sparse.view(), frames: task.calibration.picture_frames as usize };
-        let coded = images.means(task.row_codes())?;
-        let code = CodedPictures { images: coded.view(), lines_per_block: ROWS_PER_BLOCK };
-        let projector_rows = task.task.geometry.raster.rows;
-        let places = locate_rows(&phases, &code, lit.view(), projector_rows)?;
-        let responses = Responses::new(&phases, &white, &places, projector_rows)?;
-        responses.checks.check()?;
+        let prnu = prnu(white.white_dn.view(), Some(white.lit().view()), frames, noise)?;
+        let rows = images.rows(WhichBoard::First, &black, |frames| curve.straightened(frames, &dark))?;
+        let (places, responses) = rows.responses(images.task, &white)?;
         let columns = Columns::new(responses.place.view(), responses.response.view(), None)?;
         Ok(Self {
             dark,
@@ -312,6 +372,43 @@ impl BoardPixels {
             responses,
             columns,
         })
+    }
+
+    /// Evaluates the images of the second board, if there is one.
+    ///
+    /// # Errors
+    /// When an image is missing, board, light or pictures are of no use, or it stands elsewhere than the first.
+    pub fn second_board(&self, images: &BoardImages<'_>) -> Result<Option<SecondBoard>, CalibrationError> {
+        if !images.task.has_second_board() {
+            return Ok(None);
+        }
+        // Moments weigh what is left of a lamp far from the place by the square of the distance.
+        if self.ambient.as_ref().is_some_and(|(ambient, _)| ambient.flicker.is_some()) {
+            return Err(CalibrationError::Lamps);
+        }
+        let straight = |frames| self.curve.straightened(frames, &self.dark);
+        let [black, white] = images.black_and_white(WhichBoard::Second)?;
+        let limit_dn = self.saturation_dn.unwrap_or(f64::INFINITY);
+        let limit_dn = limit_dn.min(images.task.task.geometry.saturation_dn) as f32;
+        let evaluated = |[black, white]: [&Array3<f32>; 2]| {
+            WhiteMap::new(white.view(), black.view(), limit_dn, self.transfer.noise())
+        };
+        evaluated([&black, &white])
+            .and_then(|counted| counted.check(limit_dn))
+            .map_err(CalibrationError::SecondBoard)?;
+        let [black, white] = [black, white].map(straight);
+        let map = evaluated([&black, &white]).map_err(CalibrationError::SecondBoard)?;
+        let rows = images.rows(WhichBoard::Second, &black, straight)?;
+        let (_, responses) = rows.responses(images.task, &map).map_err(CalibrationError::SecondBoard)?;
+        let pairs = responses.place.iter().zip(&self.responses.place);
+        let away_rows = median(pairs.map(|(second, first)| (second - first).abs()));
+        // The times are those of the places on the first board.
+        if away_rows > MOST_AWAY_ROWS {
+            return Err(CalibrationError::Elsewhere { away_rows });
+        }
+        let comparison =
+            compare_responses(&self.responses, &responses).map_err(CalibrationError::SecondBoard)?;
+        Ok(Some(SecondBoard { responses, comparison }))
     }
 
     /// The room's light in an image of a single frame, unless the room is dark.
@@ -470,7 +567,8 @@ fn room(
     noise: SensorNoise,
 ) -> Result<Option<(Ambient, Option<u32>)>, CalibrationError> {
     let Some(run) = images.run_of_ambient() else { return Ok(None) };
-    let exposures = [(BoardPurpose::Black, WHOLE_US), (BoardPurpose::Ambient, AMBIENT_US)];
+    let black = BoardPurpose::Response(WhichBoard::First, BoardPicture::Black);
+    let exposures = [(black, WHOLE_US), (BoardPurpose::Ambient, AMBIENT_US)];
     let taken = |run: Option<u32>| {
         let [black, short] = exposures.map(|(purpose, exposure_us)| {
             let (frames, opened_s) = images.timed_frames(purpose, run)?;

@@ -14,21 +14,24 @@ use raysweep_config::plan::CalibrationPlan;
 use raysweep_session::ledger::State;
 use raysweep_session::{Result, Session, durable};
 use raysweep_transport::plane::board::Estimate;
-use raysweep_transport::plane::board::images::MOST_BEND;
+use raysweep_transport::plane::board::images::{MOST_BEND, Narrower, Responses};
 use raysweep_transport::plane::board::times::RowTimes;
 use raysweep_transport::plane::calibrate::FlyingSpot;
 
 pub use self::drawing::{CalibratedDrawing, Scanning};
 pub use self::file::{
-    CalibratedAmbient, CalibratedFlicker, CalibrationArrays, CalibrationHeader, KeptCalibration, Pair,
-    ValidFor, current_in,
+    CalibratedAmbient, CalibratedFlicker, CalibratedLight, CalibrationArrays, CalibrationHeader,
+    KeptCalibration, Pair, ResponseOf, ValidFor, current_in,
 };
-use self::file::{CalibratedLight, CalibratedTiming, SCHEMA};
-pub use self::images::{BoardImages, BoardPixels, CalibrationError, MeasuredCurve};
-pub use self::task::{BoardPurpose, BoardView, CalibrationTask};
+use self::file::{CalibratedTiming, SCHEMA};
+pub use self::images::{BoardImages, BoardPixels, CalibrationError, MeasuredCurve, SecondBoard};
+pub use self::task::{BoardPicture, BoardPurpose, BoardView, CalibrationTask, WhichBoard};
 use crate::plane::{KnownRig, manifest};
 use crate::stored::{Asked, ProcessError, Processed, Stored};
 
+/// What light may spread inside a board of painted metal, which one board cannot tell from the beam: paint of a tenth of
+/// a millimetre, under rows of about a millimetre.
+const PAINT_ROWS: f64 = 0.1;
 /// Latency that is known no better than this is said to be uncertain.
 const MOST_LATENCY_SD_US: f64 = 0.5;
 
@@ -40,6 +43,8 @@ pub struct BoardFindings {
     pub times: RowTimes,
     /// The spot that draws the rows; `None` if they are lit evenly.
     pub spot: Option<FlyingSpot>,
+    /// Of each pixel of a second board, or why it is of no use; `None` without one.
+    pub second: Option<std::result::Result<SecondBoard, CalibrationError>>,
 }
 
 impl BoardFindings {
@@ -48,9 +53,41 @@ impl BoardFindings {
     /// # Errors
     /// When an image is missing, or the result is not good enough to be used.
     pub fn new(images: &BoardImages<'_>) -> std::result::Result<Self, CalibrationError> {
-        let pixels = BoardPixels::new(images)?;
+        Self::with_pixels(BoardPixels::new(images)?, images)
+    }
+
+    /// The same, of which the pixels of the first board are evaluated already.
+    ///
+    /// # Errors
+    /// Those of [`Self::new`].
+    pub fn with_pixels(
+        pixels: BoardPixels,
+        images: &BoardImages<'_>,
+    ) -> std::result::Result<Self, CalibrationError> {
         let (times, spot) = pixels.times(images)?;
-        Ok(Self { pixels, times, spot })
+        let second = match pixels.second_board(images) {
+            // What the first board tells is as good without it.
+            Err(
+                error @ (CalibrationError::SecondBoard(_)
+                | CalibrationError::Elsewhere { .. }
+                | CalibrationError::Lamps),
+            ) => Some(Err(error)),
+            second => second?.map(Ok),
+        };
+        Ok(Self { pixels, times, spot, second })
+    }
+
+    /// The responses that are nearest to those of the beam: the narrower ones.
+    fn responses(&self) -> &Responses {
+        match &self.second {
+            Some(Ok(second)) if second.comparison.narrower == Narrower::Second => &second.responses,
+            _ => &self.pixels.responses,
+        }
+    }
+
+    /// What was found beside the figures, in a sentence each.
+    pub fn found(&self) -> Vec<String> {
+        self.second.iter().flatten().map(|second| second.comparison.to_string()).collect()
     }
 
     /// What is worth knowing about a result that is good enough.
@@ -65,7 +102,10 @@ impl BoardFindings {
         let unseen = matches!(self.pixels.ambient, Some((_, None))).then(|| {
             "whether the room's light flickers was not looked for, because the calibration was interrupted among its black pictures; if lamps are on, calibrate again".to_owned()
         });
-        latency.into_iter().chain(curve).chain(unseen).collect()
+        let second = self.second.iter().filter_map(|second| second.as_ref().err());
+        let second =
+            second.map(|error| format!("{error}; the responses are those of the first, of beam and board"));
+        latency.into_iter().chain(curve).chain(unseen).chain(second).collect()
     }
 
     /// The calibration, in the form in which it is kept.
@@ -73,7 +113,14 @@ impl BoardFindings {
     /// # Errors
     /// When it cannot be encoded.
     pub fn keep(&self, session: &Session, state: &State, valid_for: ValidFor) -> Result<KeptCalibration> {
-        let Self { pixels, times, spot } = self;
+        let Self { pixels, times, spot, second } = self;
+        let responses = self.responses();
+        // What the responses may contain of a board, as a second moment.
+        let (response_of, of_board) = match second {
+            Some(Ok(second)) => (ResponseOf::Beam, second.comparison.resolution),
+            None | Some(Err(_)) => (ResponseOf::BeamAndBoard, PAINT_ROWS.powi(2)),
+        };
+        let width_sd = responses.width_sd().hypot(responses.widened_by(of_board));
         let name = session.dir().file_name().unwrap_or(session.dir().as_os_str());
         let header = CalibrationHeader {
             schema: SCHEMA,
@@ -98,7 +145,8 @@ impl BoardFindings {
                 linearity_per_dn: pixels.curve.known().map(|linearity| pair(linearity.per_dn)),
                 saturation_dn: pixels.saturation_dn,
                 hot_pixels: pixels.dark.hot.iter().filter(|hot| **hot).count(),
-                response_width_sd: Some(pixels.responses.width_sd()),
+                response_width_sd: Some(width_sd),
+                response_of: Some(response_of),
             },
             drawing: Some(CalibratedDrawing::of(spot.as_ref())),
             ambient: self.ambient(),
@@ -109,7 +157,7 @@ impl BoardFindings {
             what: "the calibration".into(),
             why: error.to_string(),
         };
-        let response = pixels.responses.pixel_response().map_err(unusable)?;
+        let response = responses.pixel_response().map_err(unusable)?;
         let lit = pixels.white.lit();
         let where_lit = |image: &ndarray::Array2<f32>| {
             let mut image = image.clone();
@@ -124,7 +172,7 @@ impl BoardFindings {
             row_starts_us: Array1::from(times.row_starts_us.clone()),
             row_starts_modes: times.row_starts_modes.clone(),
             place: response.places().to_owned(),
-            place_sd: pixels.responses.place_sd.clone(),
+            place_sd: responses.place_sd.clone(),
             response: response.shares().to_owned(),
             white_dn: where_lit(&pixels.white.white_dn),
             white_sd: where_lit(&pixels.white.sd_dn),

@@ -155,7 +155,7 @@ fn times(task: &CalibrationTask, findings: &BoardFindings) -> Section {
 }
 
 fn responses(findings: &BoardFindings) -> Section {
-    let responses = &findings.pixels.responses;
+    let responses = findings.responses();
     let (rows, columns) = responses.place.dim();
     // Pixels look at different fractions of a row, and together they show the beam between the rows.
     let sampled = |part: Range<usize>| -> Vec<(f64, f64)> {
@@ -190,11 +190,17 @@ fn responses(findings: &BoardFindings) -> Section {
     let scale = ToneMap::percentile(&[offset.view()], 99.5);
     let caption = format!("place minus camera row, beyond its smallest value of {least:.2} rows");
     let picture = Picture::grey(offset.view(), scale).with_caption(caption);
-    section(
-        "Where pixels look",
-        "From pictures of every 16th row. If the board scatters light inside, the response contains that: a second board of another material shows it.",
-        vec![Block::Plots(vec![kernel]), Block::Pictures(vec![picture])],
-    )
+    let intro = match findings.second {
+        None | Some(Err(_)) => {
+            "From pictures of every 16th row. If the board scatters light inside, the response contains that: a second board of another material shows it (calibration.boards = 2)."
+        }
+        Some(Ok(_)) => {
+            "From pictures of every 16th row on two boards; those of the narrower response are shown."
+        }
+    };
+    let notes = findings.found().into_iter().map(|found| Block::Note(NoteLevel::Info, found));
+    let blocks = notes.chain([Block::Plots(vec![kernel]), Block::Pictures(vec![picture])]);
+    section("Where pixels look", intro, blocks.collect())
 }
 
 fn pixels(findings: &BoardFindings) -> Section {

@@ -21,23 +21,17 @@ use crate::plane::{KnownRig, PlaneTask};
 pub enum BoardPurpose {
     /// The dark image of one of the plan's exposures, with the lens capped.
     Capped(usize),
-    /// The board under the projector's black.
-    Black,
-    /// The same in a shorter exposure, which tells the room's light from the projector's black.
+    /// What tells how a pixel responds to rows, of each board.
+    Response(WhichBoard, BoardPicture),
+    /// The first board under the projector's black in a shorter exposure, which tells the room's light from the projector's black.
     Ambient,
-    /// The board under white, its light inside the exposure.
-    White,
-    /// The same under one of the [`GREYS`].
+    /// The board under one of the [`GREYS`], its light inside the exposure.
     Grey(usize),
     /// The board under grey, in an exposure with this many passes of the beam: how linear the camera is.
     Passes(usize),
     /// The board under white, in as long an exposure as the longest of those: where pixels saturate.
     Saturated,
-    /// The board under every 16th row, beginning with this one.
-    Rows(usize),
-    /// The board under a picture of the rows' Gray code: the highest bit first, each followed by its inverse.
-    RowCode(usize),
-    /// The same of the columns' Gray code.
+    /// The board under a picture of the columns' Gray code: the highest bit first, each followed by its inverse.
     ColumnCode(usize),
     /// The white board with a global shutter: when the rows are lit.
     SweepTime,
@@ -45,6 +39,28 @@ pub enum BoardPurpose {
     Arrival,
     /// The white board in longer exposures: whether they are as long as they should be.
     ExposureCheck,
+}
+
+/// One of the boards.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum WhichBoard {
+    /// The one from which all is measured.
+    First,
+    /// One of another material, whose response alone is measured.
+    Second,
+}
+
+/// A picture on a board, its light inside the exposure.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum BoardPicture {
+    /// The projector's black.
+    Black,
+    /// White.
+    White,
+    /// Every 16th row, beginning with this one.
+    Rows(usize),
+    /// A picture of the rows' Gray code: the highest bit first, each followed by its inverse.
+    RowCode(usize),
 }
 
 /// What stands before the camera, and what the projector shows.
@@ -90,8 +106,8 @@ const GREY_FRAMES: usize = 8;
 pub struct CalibrationTask {
     /// The plan's own table.
     pub calibration: CalibrationPlan,
-    /// Its points, with settings as foreseen from the rig file. Those of the last three purposes follow from images
-    /// taken before them: see [`Self::sweep_times`], [`Self::first_arrivals`] and [`Self::arrivals`].
+    /// Its points, with settings as foreseen from the rig file. Those of the sweep's times, the arrivals and the checks of
+    /// exposures follow from images taken before them: see [`Self::sweep_times`], [`Self::first_arrivals`] and [`Self::arrivals`].
     pub task: Arc<PlaneTask>,
     /// The purpose of each point.
     purposes: Vec<BoardPurpose>,
@@ -154,18 +170,16 @@ impl CalibrationTask {
             *index += 1;
             let (exposure_us, frames) = match *purpose {
                 BoardPurpose::Capped(exposure) => (calibration.exposure_us.values()[exposure], 1),
-                BoardPurpose::Rows(_) => (WHOLE_US, calibration.picture_frames),
+                BoardPurpose::Response(_, BoardPicture::Rows(_)) => (WHOLE_US, calibration.picture_frames),
                 BoardPurpose::SweepTime => (raster.rows as f64 * raster.row_time_us * 0.5, 1),
                 BoardPurpose::Arrival => (3.0 * raster.row_time_us, 1),
                 BoardPurpose::ExposureCheck => (1200.0, 1),
                 BoardPurpose::Ambient => (AMBIENT_US, 1),
                 BoardPurpose::Passes(passes) => (passes as f64 * raster.period_us, 1),
                 BoardPurpose::Saturated => (f64::from(calibration.passes) * raster.period_us, 1),
-                BoardPurpose::Black
-                | BoardPurpose::White
-                | BoardPurpose::Grey(_)
-                | BoardPurpose::RowCode(_)
-                | BoardPurpose::ColumnCode(_) => (WHOLE_US, 1),
+                BoardPurpose::Response(..) | BoardPurpose::Grey(_) | BoardPurpose::ColumnCode(_) => {
+                    (WHOLE_US, 1)
+                }
             };
             let delay_us = match purpose {
                 BoardPurpose::SweepTime | BoardPurpose::Arrival | BoardPurpose::ExposureCheck => 0.0,
@@ -205,13 +219,21 @@ impl CalibrationTask {
 
     /// What the frames of a purpose show.
     pub fn view(&self, purpose: BoardPurpose) -> BoardView {
-        let picture = match purpose {
+        let subject = match purpose {
             BoardPurpose::Capped(_) => return BoardView { subject: Subject::Cap, picture: None },
-            BoardPurpose::Black | BoardPurpose::Ambient => Pattern::Black,
+            BoardPurpose::Response(WhichBoard::Second, _) => Subject::SecondBoard,
+            _ => Subject::Board,
+        };
+        let picture = match purpose {
+            BoardPurpose::Capped(_)
+            | BoardPurpose::Ambient
+            | BoardPurpose::Response(_, BoardPicture::Black) => Pattern::Black,
             BoardPurpose::Grey(grey) => Pattern::Grey { level: GREYS[grey] },
             BoardPurpose::Passes(_) => Pattern::Grey { level: PASSES_GREY },
-            BoardPurpose::Rows(phase) => Pattern::SparseRows { phase, period: PHASES },
-            BoardPurpose::RowCode(picture) => Pattern::GrayRows {
+            BoardPurpose::Response(_, BoardPicture::Rows(phase)) => {
+                Pattern::SparseRows { phase, period: PHASES }
+            }
+            BoardPurpose::Response(_, BoardPicture::RowCode(picture)) => Pattern::GrayRows {
                 bit: row_bits(self.task.geometry.raster.rows) - 1 - picture as u32 / 2,
                 inverse: picture % 2 == 1,
                 block: ROWS_PER_BLOCK,
@@ -221,13 +243,13 @@ impl CalibrationTask {
                 inverse: picture % 2 == 1,
                 block: COLUMNS_PER_BLOCK,
             },
-            BoardPurpose::White
+            BoardPurpose::Response(_, BoardPicture::White)
             | BoardPurpose::Saturated
             | BoardPurpose::SweepTime
             | BoardPurpose::Arrival
             | BoardPurpose::ExposureCheck => Pattern::White,
         };
-        BoardView { subject: Subject::Board, picture: Some(picture) }
+        BoardView { subject, picture: Some(picture) }
     }
 
     /// How the rows are exposed for a purpose.
@@ -245,14 +267,19 @@ impl CalibrationTask {
         (1..=self.calibration.passes as usize).map(|passes| (passes, BoardPurpose::Passes(passes)))
     }
 
-    /// The purposes of the pictures of sparse rows.
-    pub(super) fn phases() -> impl Iterator<Item = BoardPurpose> {
-        (0..PHASES).map(BoardPurpose::Rows)
+    /// Whether there is a second board.
+    pub(super) fn has_second_board(&self) -> bool {
+        self.calibration.boards > 1
     }
 
-    /// The purposes of the pictures of the rows' Gray code.
-    pub(super) fn row_codes(&self) -> impl Iterator<Item = BoardPurpose> + use<> {
-        (0..2 * row_bits(self.task.geometry.raster.rows) as usize).map(BoardPurpose::RowCode)
+    /// The purposes of a board's pictures of sparse rows.
+    pub(super) fn phases(board: WhichBoard) -> impl Iterator<Item = BoardPurpose> {
+        (0..PHASES).map(move |phase| BoardPurpose::Response(board, BoardPicture::Rows(phase)))
+    }
+
+    /// The purposes of a board's pictures of the rows' Gray code.
+    pub(super) fn row_codes(&self, board: WhichBoard) -> impl Iterator<Item = BoardPurpose> + use<> {
+        row_codes(self.task.geometry.raster.rows, board)
     }
 
     /// Those of the pictures of the columns' Gray code; empty for a session from before they were taken.
@@ -381,24 +408,38 @@ fn purposes(plan: &CalibrationPlan, projector_rows: usize) -> Vec<BoardPurpose> 
     let several = |purpose, frames| std::iter::repeat_n(purpose, frames);
     let capped =
         (0..plan.exposure_us.len()).flat_map(|exposure| several(BoardPurpose::Capped(exposure), frames));
-    let levels = [BoardPurpose::Black, BoardPurpose::Ambient, BoardPurpose::White]
+    let of = BoardPurpose::Response;
+    let [first, second] = [WhichBoard::First, WhichBoard::Second];
+    let [black, white] = [BoardPicture::Black, BoardPicture::White];
+    let levels = [of(first, black), BoardPurpose::Ambient, of(first, white)]
         .map(|purpose| several(purpose, 2 * frames));
     let greys = (0..GREYS.len()).flat_map(|grey| several(BoardPurpose::Grey(grey), GREY_FRAMES));
     let passes =
         (1..=plan.passes as usize).flat_map(|passes| several(BoardPurpose::Passes(passes), PASSES_FRAMES));
     let saturated = several(BoardPurpose::Saturated, if plan.passes > 0 { SATURATED_FRAMES } else { 0 });
-    let row_codes = 2 * row_bits(projector_rows) as usize;
+    let second_board = [of(second, black), of(second, white)]
+        .into_iter()
+        .flat_map(|purpose| several(purpose, frames))
+        .chain(CalibrationTask::phases(second))
+        .chain(row_codes(projector_rows, second));
     let column_codes = 2 * column_bits() as usize;
     capped
         .chain(levels.into_iter().flatten())
         .chain(greys)
         .chain(passes)
         .chain(saturated)
-        .chain((0..PHASES).map(BoardPurpose::Rows))
-        .chain((0..row_codes).map(BoardPurpose::RowCode))
+        .chain(CalibrationTask::phases(first))
+        .chain(row_codes(projector_rows, first))
         .chain((0..column_codes).map(BoardPurpose::ColumnCode))
         .chain(several(BoardPurpose::SweepTime, SWEEP_TIMES))
         .chain(several(BoardPurpose::Arrival, ARRIVAL_PASSES * plan.delays as usize))
         .chain(several(BoardPurpose::ExposureCheck, EXPOSURE_CHECKS))
+        .chain(second_board.filter(|_| plan.boards > 1))
         .collect()
+}
+
+/// The purposes of a board's pictures of the rows' Gray code.
+fn row_codes(projector_rows: usize, board: WhichBoard) -> impl Iterator<Item = BoardPurpose> {
+    let pictures = 0..2 * row_bits(projector_rows) as usize;
+    pictures.map(move |picture| BoardPurpose::Response(board, BoardPicture::RowCode(picture)))
 }

@@ -11,7 +11,7 @@ use raysweep_core::SettingsId;
 use raysweep_pipeline::Point;
 use raysweep_processing::calibration::{
     BoardFindings, BoardImages, BoardPixels, BoardPurpose, BoardView, CalibrationError, CalibrationTask,
-    ValidFor,
+    ValidFor, WhichBoard,
 };
 use raysweep_processing::plane::Processing;
 use raysweep_session::Session;
@@ -78,11 +78,14 @@ struct BoardAcquisition<'a, 'p> {
 impl BoardAcquisition<'_, '_> {
     /// Acquires all images; returns what those of each pixel say, or `None` if the run was ended.
     fn run(mut self) -> Result<Option<BoardPixels>, RunError> {
-        let points: Vec<(u32, Point)> = (0..)
-            .zip(self.calibration.task.schedule.points.iter().copied())
-            .filter(|&(ordinal, _)| !is_adapted(self.calibration.purpose(ordinal)))
-            .collect();
-        self.acquire(&points)?;
+        let points: Vec<(u32, Point)> =
+            (0..).zip(self.calibration.task.schedule.points.iter().copied()).collect();
+        let purpose = |&(ordinal, _): &(u32, Point)| self.calibration.purpose(ordinal);
+        let (second_board, others): (Vec<_>, Vec<_>) = points
+            .into_iter()
+            .filter(|point| !is_adapted(purpose(point)))
+            .partition(|point| matches!(purpose(point), BoardPurpose::Response(WhichBoard::Second, _)));
+        self.acquire(&others)?;
         if !self.passes.go_on() {
             return Ok(None);
         }
@@ -103,6 +106,9 @@ impl BoardAcquisition<'_, '_> {
         let arrivals =
             self.calibration.arrivals(&pixels.columns, &rolling).map_err(CalibrationError::from)?;
         self.acquire(&arrivals)?;
+        if self.passes.go_on() {
+            self.acquire(&second_board)?;
+        }
         Ok(self.passes.go_on().then_some(pixels))
     }
 
@@ -176,8 +182,8 @@ impl Measurement for CalibrationRun {
         if let (None, Some(pixels)) = (&fault, pixels) {
             let stack = session.stack()?;
             let images = BoardImages { task: &calibration, state: ledger.state(), stack: &stack };
-            match pixels.times(&images) {
-                Ok((times, spot)) => found = Some(BoardFindings { pixels, times, spot }),
+            match BoardFindings::with_pixels(pixels, &images) {
+                Ok(findings) => found = Some(findings),
                 Err(error) => fault = Some(error.into()),
             }
         }
@@ -195,15 +201,15 @@ impl Measurement for CalibrationRun {
             ..end_entry(state, stored, ledger.state().missing_points())
         };
         ledger.append(&Entry::End(end.clone()))?;
-        let mut warnings = Vec::new();
+        let (mut warnings, mut said) = (Vec::new(), Vec::new());
         if let Some(found) = found {
             let size = (task.geometry.height, task.geometry.width);
             let valid_for = ValidFor::new(&rig.file, &rig.text, &camera, size);
             let kept = found.keep(&session, ledger.state(), valid_for)?;
             found.write(&kept, &session, ledger.state(), &calibration, &rig.file)?;
             kept.use_in(&data)?;
-            warnings = found.warnings();
+            (warnings, said) = (found.warnings(), found.found());
         }
-        Ok(Ended { end, warnings, found: Vec::new() })
+        Ok(Ended { end, warnings, found: said })
     }
 }

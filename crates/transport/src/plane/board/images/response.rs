@@ -183,12 +183,18 @@ impl Responses {
             // The width is the root of the variance.
             sds.iter().zip(ROWS).map(of_row).sum::<f64>().sqrt() / (2.0 * variance)
         };
-        let mut widths: Vec<f64> = ndarray::indices(self.place.dim())
-            .into_iter()
-            .map(relative)
-            .filter(|sd| sd.is_finite())
-            .collect();
-        median(&mut widths).unwrap_or(0.0)
+        self.median_of(relative)
+    }
+
+    /// By how much light that spreads inside the board with this second moment, in rows^2, widens a response, relative to
+    /// itself: the median over the lit pixels. A response is at least as wide as a row.
+    pub fn widened_by(&self, moment: f64) -> f64 {
+        self.median_of(|(t, s)| moment / (2.0 * self.second_moment(t, s).max(ROW_MOMENT)))
+    }
+
+    fn median_of(&self, of_pixel: impl Fn((usize, usize)) -> f64) -> f64 {
+        let values = ndarray::indices(self.place.dim()).into_iter().map(of_pixel);
+        median(&mut values.filter(|value| value.is_finite()).collect::<Vec<_>>()).unwrap_or(0.0)
     }
 
     /// Second central moment of a pixel's response, in rows^2; NaN where unlit.
@@ -458,6 +464,8 @@ pub struct ResponseComparison {
     pub second_moments: [f64; 2],
     /// The second board's moment minus the first's.
     pub difference: Estimate,
+    /// The smallest difference of the moments that counts.
+    pub resolution: f64,
 }
 
 impl fmt::Display for ResponseComparison {
@@ -484,6 +492,8 @@ impl fmt::Display for ResponseComparison {
     }
 }
 
+/// Second moment of a row that is lit evenly.
+const ROW_MOMENT: f64 = 1.0 / 12.0;
 /// Groups of pixels by the fraction of their place: the moment of a sharp-edged beam depends on it.
 const FRACTIONS: usize = 16;
 /// Number of pixels that share their light through averaging.
@@ -518,14 +528,14 @@ pub fn compare_responses(first: &Responses, second: &Responses) -> Result<Respon
     let n = f64::from(groups);
     let second_moments = sums.map(|sum| sum / n);
     let difference = Estimate { value: second_moments[1] - second_moments[0], sd: variance.sqrt() / n };
-    let least =
+    let resolution =
         (DIFFERENCE_SIGMAS * difference.sd).max(DIFFERENCE_SHARE * second_moments[0].max(second_moments[1]));
     let narrower = match difference.value {
-        value if value > least => Narrower::First,
-        value if value < -least => Narrower::Second,
+        value if value > resolution => Narrower::First,
+        value if value < -resolution => Narrower::Second,
         _ => Narrower::Neither,
     };
-    Ok(ResponseComparison { narrower, second_moments, difference })
+    Ok(ResponseComparison { narrower, second_moments, difference, resolution })
 }
 
 /// Mean second moment of the pixels of each fraction of a row, if there are enough of them.
