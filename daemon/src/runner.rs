@@ -362,7 +362,12 @@ impl Runner {
             shape: foreseen.shape,
             first_row: foreseen.first_row,
         };
-        let texts = [params.plan.as_str(), self.rig.text()];
+        // The session states what it measured, whatever later versions choose.
+        let plan = match &foreseen.report.settings {
+            Some(table) => with_tables(&params.plan, table).map_err(|error| invalid_plan(&error))?,
+            None => params.plan.clone(),
+        };
+        let texts = [plan.as_str(), self.rig.text()];
         let keep = |session: &Session| foreseen.procedure.keep(session).map_err(NotBegun);
         let (session, ledger) =
             Session::create_with(&self.data, entry, texts, keep).map_err(|NotBegun(error)| error)?;

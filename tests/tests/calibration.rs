@@ -9,10 +9,12 @@ use std::path::Path;
 use ndarray::{Array2, Array3, Axis, s};
 use raysweep::control::Control;
 use raysweep::rig::Rig;
-use raysweep_config::Plan;
 use raysweep_config::plan::CalibrationPlan;
+use raysweep_config::{Plan, Procedure};
 use raysweep_pipeline::mask;
-use raysweep_processing::calibration::{CalibrationTask, KeptCalibration, current_in};
+use raysweep_processing::calibration::{
+    CalibratedLight, CalibrationTask, KeptCalibration, ResponseOf, current_in,
+};
 use raysweep_processing::plane::KnownRig;
 use raysweep_session::film::TransportFilm;
 use raysweep_session::stack::{ArrayName, Contents};
@@ -190,6 +192,44 @@ fn an_interrupted_calibration_is_resumed_to_the_same_bits() {
         let again = kept(&whole.session).header;
         assert_eq!((again.light, again.timing), (header.light.clone(), header.timing.clone()));
     }
+}
+
+#[test]
+fn a_calibration_that_was_interrupted_at_its_second_board_is_resumed_to_the_same_bits() {
+    let bench = Bench::new(&small("[sim.board]\nsecond_scatter_rows = 0.7\nsecond_scatter_share = 1.0\n"));
+    let whole = bench.run(&format!("{}boards = 2\n", quick()));
+    assert_eq!(whole.state, "complete", "{:?}", whole.error);
+    // The first board scatters nothing, so that it is taken.
+    let alone = kept(&bench.run(&quick()).session);
+    let [with_two, with_one] = [kept(&whole.session), alone].map(|kept| (kept.header.light, kept.arrays));
+    let of = |light: &CalibratedLight| light.response_of.unwrap();
+    assert_eq!([of(&with_two.0), of(&with_one.0)], [ResponseOf::Beam, ResponseOf::BeamAndBoard]);
+    let widths = [&with_two.1, &with_one.1].map(|arrays| arrays.response.mapv(|share| share * share).sum());
+    assert!((widths[0] / widths[1] - 1.0).abs() < 0.01, "{widths:?}");
+    let page = fs::read_to_string(whole.session.join("report.html")).unwrap();
+    assert!(page.contains("the second board scatters light"), "the report names the board");
+
+    let ledger = whole.session.join("ledger.jsonl");
+    let arrays = fs::read(whole.session.join("calibration.npz")).unwrap();
+    let lines: Vec<String> = fs::read_to_string(&ledger).unwrap().lines().map(Into::into).collect();
+    fs::write(&ledger, lines[..lines.len() - 12].join("\n") + "\n").unwrap();
+    fs::remove_file(whole.session.join("calibration.npz")).unwrap();
+    let resumed = bench.resume(&whole.session);
+    assert_eq!(resumed.state, "complete", "{:?}", resumed.error);
+    assert!(fs::read(whole.session.join("calibration.npz")).unwrap() == arrays);
+}
+
+#[test]
+fn what_a_lamp_leaves_is_not_taken_for_a_board() {
+    let bench = Bench::new(&small("[sim.ambient]\nlevel = 0.0002\nflicker = 0.3\n"));
+    let ended = bench.run(&format!("{}boards = 2\n", quick()));
+    assert_eq!(ended.state, "complete", "{:?}", ended.error);
+    assert_eq!(kept(&ended.session).header.light.response_of, Some(ResponseOf::BeamAndBoard));
+    let page = fs::read_to_string(ended.session.join("report.html")).unwrap();
+    assert!(
+        page.contains("the second board: the room&#39;s light flickers")
+            || page.contains("the second board: the room's light flickers")
+    );
 }
 
 #[test]
@@ -372,6 +412,47 @@ fn calibrations_are_listed_and_chosen() {
     let refused = control.use_calibration(Path::new("none")).unwrap_err();
     assert!(refused.message.contains("`raysweep sessions` lists the names"), "{}", refused.message);
     assert!(sweep.session.join("calibration.toml").exists());
+}
+
+#[test]
+fn a_plan_without_settings_gets_those_that_suit_the_calibration() {
+    let settings = |jitter_us: f64, plan: &str| {
+        let bench = Bench::new(&small(&format!("[sim.projector]\nphase_jitter_us = {jitter_us}\n")));
+        let uncalibrated = bench.runner.check(plan).unwrap();
+        assert_eq!(uncalibrated.settings, None);
+        assert_eq!(bench.run(&quick()).state, "complete");
+        let report = bench.runner.check(plan).unwrap();
+        let ended = bench.run(plan);
+        assert_eq!(ended.state, "complete", "{:?}", ended.error);
+        let stated = fs::read_to_string(ended.session.join("plan.toml")).unwrap();
+        (report.settings, stated, (bench, ended))
+    };
+    let sweep = "kind = \"sweep\" # mine\n[sweep]\naverage = 1\n";
+    let (chosen, stated, (bench, ended)) = settings(0.0, sweep);
+    assert!(stated.contains("# mine") && stated.contains("[[sweep.extra]]"), "{stated}");
+    assert!(stated.ends_with(&chosen.unwrap()));
+    // A later version may choose others: the session has its own.
+    let transport = fs::read(ended.session.join("products/transport.npy")).unwrap();
+    raysweep_processing::process(&ended.session).unwrap();
+    assert!(fs::read(ended.session.join("products/transport.npy")).unwrap() == transport);
+    drop(bench);
+    let (chosen, stated, _) = settings(5.0, sweep);
+    assert_eq!((chosen, stated.as_str()), (None, sweep));
+    let film = "kind = \"film\"\n[film]\ncycles = 1\n";
+    let delays = |jitter_us| {
+        let (chosen, stated, _) = settings(jitter_us, film);
+        let film = |text: &str| {
+            let Procedure::Film(film) = Plan::parse(text).unwrap().procedure else { panic!("{text}") };
+            film
+        };
+        assert_eq!(film(&stated), film(&format!("kind = \"film\"\n{}", chosen.unwrap())));
+        film(&stated).delay_us.values()
+    };
+    let near_rows = |delays: Vec<f64>| {
+        let edges = delays.into_iter().map(|delay_us| (delay_us.abs() - 300.0).abs() / 22.22);
+        edges.fold(f64::INFINITY, f64::min)
+    };
+    assert!(near_rows(delays(0.0)) < 0.51 && near_rows(delays(5.0)) > 3.0);
 }
 
 /// A sensor whose wells are full at three quarters of the converter's range: samples beyond that are bounds, not light.

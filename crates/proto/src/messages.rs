@@ -271,6 +271,10 @@ pub struct CheckReport {
     pub disk_bytes: u64,
     /// Free disk space.
     pub disk_free_bytes: u64,
+    /// The table of a sweep or film whose settings were chosen for the calibration in use, because the plan states none;
+    /// `None` for other plans.
+    #[serde(default)]
+    pub settings: Option<String>,
     /// First and last relative row that a plane rig's plan covers; `None` on a dot rig.
     #[serde(default)]
     pub reach_rows: Option<(i32, i32)>,

@@ -28,6 +28,8 @@ const PICTURES: u64 = 8;
 const CONFIDENCE: f64 = 1.6;
 /// A scene that could be this much brighter is worth opening the aperture for.
 const WORTHWHILE: f64 = 1.1;
+/// Edges nearer to the pixel's own row than this share of the exposure divide the light about it.
+const NEAR_EDGES: f64 = 0.15;
 /// Averaging over more frames is not proposed.
 const MAX_AVERAGE: f64 = 64.0;
 /// How long a picture may take to come.
@@ -41,7 +43,14 @@ pub(super) fn expose(socket: &Path, path: &Path, printer: Printer) -> Result<Exi
     let text = read_plan(path)?;
     let refused = |error| CommandFailure::of_plan(error, path, &text);
     let mut client = Client::connect(socket)?;
-    client.check(&text).map_err(refused)?;
+    let foreseen = client.check(&text).map_err(refused)?;
+    // Settings that the plan leaves to the calibration are stated in what is proposed.
+    let text = match foreseen.settings {
+        Some(table) => {
+            with_tables(&text, &table).map_err(|error| CommandFailure::Exposure(error.to_string()))?
+        }
+        None => text,
+    };
     let exposures_us = Plan::parse(&text).ok().and_then(|plan| exposures(&plan.procedure));
     let Some((shortest_us, longest_us)) = exposures_us else {
         let message = "the plan has no exposures to choose: give a plan of kind \"sweep\" or \"film\"";
@@ -89,11 +98,31 @@ fn limited(text: &str, most_us: f64) -> Result<String, CommandFailure> {
     changed(text, |procedure| match procedure {
         Procedure::Sweep(sweep) => {
             sweep.exposure_us = limit(&sweep.exposure_us);
-            sweep.extra.iter_mut().for_each(|grid| grid.exposure_us = limit(&grid.exposure_us));
+            for grid in &mut sweep.extra {
+                if let [exposure_us] = grid.exposure_us.values()[..] {
+                    grid.delay_us = with_edges(&grid.delay_us, exposure_us, exposure_us.min(most_us));
+                }
+                grid.exposure_us = limit(&grid.exposure_us);
+            }
         }
-        Procedure::Film(film) => film.exposure_us = film.exposure_us.min(most_us),
+        Procedure::Film(film) => {
+            let shorter_us = film.exposure_us.min(most_us);
+            film.delay_us = with_edges(&film.delay_us, film.exposure_us, shorter_us);
+            film.exposure_us = shorter_us;
+        }
         _ => {}
     })
+}
+
+/// The delays for a shorter exposure. Where an edge lay near the pixel's own row, it stays where it was.
+fn with_edges(delays: &Axis, exposure_us: f64, shorter_us: f64) -> Axis {
+    let half_us = (exposure_us - shorter_us) / 2.0;
+    let moved = |delay_us: f64| {
+        let is_near = (delay_us.abs() - exposure_us / 2.0).abs() < NEAR_EDGES * exposure_us;
+        let moved_us = if is_near { delay_us - half_us.copysign(delay_us) } else { delay_us };
+        (moved_us * 100.0).round() / 100.0
+    };
+    Axis::of_values(delays.values().into_iter().map(moved).collect())
 }
 
 /// The plan with as many frames per point that noise is as large as what averaging does not remove, and that number;
@@ -335,6 +364,13 @@ mod tests {
     use raysweep_core::FinderPicture;
 
     use super::*;
+
+    #[test]
+    fn a_shorter_exposure_keeps_its_edges_on_the_own_row() {
+        let delays = Axis::List(vec![-640.0, -311.0, 0.0, 289.0, 333.0]);
+        assert_eq!(with_edges(&delays, 600.0, 430.0).values(), [-640.0, -226.0, 0.0, 204.0, 248.0]);
+        assert_eq!(with_edges(&delays, 600.0, 600.0), delays);
+    }
 
     #[test]
     fn longer_exposures_are_shortened_and_the_rest_of_a_plan_stays() {

@@ -153,6 +153,10 @@ pub(super) fn check(report: &CheckReport) -> String {
         rows.push(("reach", format!("relative rows {first} to {last}")));
         rows.push(("condition", format!("{condition:.3e}")));
     }
+    if report.settings.is_some() {
+        let what = "chosen for the calibration in use, because the plan states none; see below";
+        rows.push(("settings", what.into()));
+    }
     rows.extend(report.advice.iter().flat_map(advice));
     if let Some(film) = &report.film {
         rows[0] = (
@@ -210,7 +214,9 @@ pub(super) fn check(report: &CheckReport) -> String {
     }
     rows.extend(report.warnings.iter().map(|warning| ("warning", warning.clone())));
     let better = report.advice.iter().filter_map(|advice| advice.better.as_ref());
-    better.fold(block(&rows), |text, better| format!("{text}\n\n{}", better.table.trim_end()))
+    let chosen = report.settings.iter().map(|table| ("the settings that are taken", table));
+    let tables = chosen.chain(better.map(|better| ("better settings", &better.table)));
+    tables.fold(block(&rows), |text, (what, table)| format!("{text}\n\n# {what}\n{}", table.trim_end()))
 }
 
 /// Expected errors and advice of `check`; the better settings' tables follow the rows.

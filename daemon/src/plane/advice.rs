@@ -96,8 +96,13 @@ const ASSUMED: Calibrated = Calibrated { latency_us: 0.3, edge_us: 0.5, exposure
 /// To what a sweep finds the latency from its own images.
 const REFINED_LATENCY_US: f64 = 0.3;
 
-/// How well a task's rig is known: as its calibration says, if it has one. Edges are known to what VSYNC stamps leave,
-/// unless a strip of the board in view shows each of them.
+/// Standard deviation with which a calibrated rig knows the edges of a single frame: what VSYNC stamps leave, unless a
+/// strip of the board in view shows each of them.
+pub fn edge_us(jitter_us: f64, has_strip: bool) -> f64 {
+    if has_strip { jitter_us.min(ASSUMED.edge_us) } else { jitter_us }
+}
+
+/// How well a task's rig is known: as its calibration says, if it has one.
 fn known<T: Searched>(of: &T) -> Calibrated {
     let Some(calibration) = &of.task().geometry.calibration else { return ASSUMED };
     let sd = |parameter| calibration.covariance.sd(parameter);
@@ -107,10 +112,7 @@ fn known<T: Searched>(of: &T) -> Calibrated {
             Arrangement::Sweep => latency_us.min(REFINED_LATENCY_US),
             Arrangement::Film => latency_us,
         },
-        edge_us: match calibration.strip {
-            Some(_) => calibration.jitter_us.min(ASSUMED.edge_us),
-            None => calibration.jitter_us,
-        },
+        edge_us: edge_us(calibration.jitter_us, calibration.strip.is_some()),
         exposure_us: sd(CalibrationParameter::ExposureOffset),
         place_rows: sd(CalibrationParameter::Place),
     }

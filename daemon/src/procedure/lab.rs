@@ -4,14 +4,17 @@ use std::path::Path;
 use std::sync::Arc;
 
 use raysweep_config::ConfigError;
+use raysweep_config::plan::{KnownRows, OwnRowEdges};
+use raysweep_config::rig::plane::SpotKind;
 use raysweep_core::{CameraCapabilities, Size};
-use raysweep_processing::calibration::KeptCalibration;
+use raysweep_processing::calibration::{KeptCalibration, Scanning};
 use raysweep_processing::memory::available_bytes;
 use raysweep_processing::plane::KnownRig;
 use raysweep_proto::{CheckReport, ErrorCode, RpcError};
 use raysweep_session::ledger::SessionEntry;
 use raysweep_session::{Session, durable};
 
+use crate::plane::advice::edge_us;
 use crate::probes::Probes;
 use crate::rig::{Rig, SharedRig};
 
@@ -59,7 +62,11 @@ impl Lab<'_> {
     }
 }
 
+/// Edges that are known less well tell nothing of the rows beside a pixel's own.
+const DIVIDING_EDGE_US: f64 = 1.0;
+
 /// A plane rig on which a plan is to run.
+#[derive(Clone)]
 pub struct RigOfRun<'a> {
     /// The rig.
     pub rig: &'a Arc<Rig>,
@@ -68,7 +75,7 @@ pub struct RigOfRun<'a> {
     /// Rows and columns of the frames.
     pub size: (usize, usize),
     /// The calibration that the run uses.
-    pub calibration: Option<KeptCalibration>,
+    pub calibration: Option<Arc<KeptCalibration>>,
 }
 
 impl<'a> RigOfRun<'a> {
@@ -89,7 +96,7 @@ impl<'a> RigOfRun<'a> {
     /// When the calibration cannot be read, or is of other devices.
     pub fn calibrated(self, lab: &Lab<'_>, folder: &Path) -> Result<Self, ConfigError> {
         let calibration = KeptCalibration::of(&self.rig.file, folder, Some(lab.camera))?;
-        Ok(Self { calibration, ..self })
+        Ok(Self { calibration: calibration.map(Arc::new), ..self })
     }
 
     /// What is known of it for the model.
@@ -99,6 +106,23 @@ impl<'a> RigOfRun<'a> {
     pub fn known(&self) -> Result<KnownRig<'a>, ConfigError> {
         let calibration = self.calibration.as_ref().map(|kept| kept.known(&self.rig.file)).transpose()?;
         Ok(KnownRig { file: &self.rig.file, first_row: self.first_row, size: self.size, calibration })
+    }
+
+    /// What its calibration tells of the projector's rows; `None` without one.
+    pub fn rows(&self) -> Option<KnownRows> {
+        let (header, file) = (&self.calibration.as_ref()?.header, &self.rig.file);
+        let timing = &header.timing;
+        let edge_us = edge_us(timing.jitter_us[0], file.calibration.strip_columns.is_some());
+        let is_spot = match &header.drawing {
+            Some(drawing) => drawing.rows != Scanning::Uniform,
+            // Calibrations of earlier versions leave it to the rig file.
+            None => file.projector.spot == SpotKind::Flying,
+        };
+        let own_row_edges = match edge_us <= DIVIDING_EDGE_US && !is_spot {
+            true => OwnRowEdges::Divide,
+            false => OwnRowEdges::Mislead,
+        };
+        Some(KnownRows { row_time_us: timing.row_time_us[0], own_row_edges })
     }
 
     /// A prediction, with what may not be true any more of the calibration.
@@ -154,6 +178,7 @@ impl Room {
             memory_free_bytes,
             disk_bytes,
             disk_free_bytes,
+            settings: None,
             reach_rows: None,
             condition: None,
             // Computed only on request: a run must not wait for it.

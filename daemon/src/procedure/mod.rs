@@ -13,7 +13,7 @@ mod viewfinder;
 
 use std::path::Path;
 
-use raysweep_config::{ConfigError, Plan, Procedure};
+use raysweep_config::{ConfigError, FilmPlan, Plan, Procedure, SweepPlan};
 use raysweep_processing::calibration::current_in;
 use raysweep_processing::plane::check_mosaic;
 use raysweep_session::ledger::SessionEntry;
@@ -28,10 +28,13 @@ use crate::run::life::Foreseen;
 /// For a plan that cannot be run on it, with the positions in the text.
 pub fn foresee(lab: &Lab<'_>, text: &str) -> Result<Foreseen, ConfigError> {
     let plan = Plan::parse(text)?;
-    let in_use = current_in(lab.data);
+    let calibrated = |rig| RigOfRun::of_new(lab, rig).calibrated(lab, &current_in(lab.data));
     let foreseen = match (lab.rig, plan.procedure.clone()) {
         (SharedRig::Plane(rig), Procedure::Sweep(own)) => {
-            sweep::foresee(lab, RigOfRun::of_new(lab, rig).calibrated(lab, &in_use)?, &plan, own)
+            let rig = calibrated(rig)?;
+            let chosen = rig.rows().and_then(|rows| own.chosen(&plan.places, rows));
+            let settings = chosen.as_ref().map(SweepPlan::to_toml);
+            chosen_or(own, chosen.zip(settings), |own| sweep::foresee(lab, rig.clone(), &plan, own))
         }
         (SharedRig::Plane(rig), Procedure::Darks(own)) => {
             darks::foresee(lab, RigOfRun::of_new(lab, rig), &plan, own)
@@ -40,10 +43,13 @@ pub fn foresee(lab: &Lab<'_>, text: &str) -> Result<Foreseen, ConfigError> {
             calibration::foresee(lab, RigOfRun::of_new(lab, rig), &plan, own, None)
         }
         (SharedRig::Plane(rig), Procedure::Patterns(own)) => {
-            patterns::foresee(lab, RigOfRun::of_new(lab, rig).calibrated(lab, &in_use)?, &plan, own)
+            patterns::foresee(lab, calibrated(rig)?, &plan, own)
         }
         (SharedRig::Plane(rig), Procedure::Film(own)) => {
-            film::foresee(lab, RigOfRun::of_new(lab, rig).calibrated(lab, &in_use)?, &plan, own)
+            let rig = calibrated(rig)?;
+            let chosen = rig.rows().and_then(|rows| own.chosen(&plan.places, rows));
+            let settings = chosen.as_ref().map(FilmPlan::to_toml);
+            chosen_or(own, chosen.zip(settings), |own| film::foresee(lab, rig.clone(), &plan, own))
         }
         (SharedRig::Dots(rig), Procedure::Batches(own)) => batches::foresee(lab, rig, &plan, own),
         (SharedRig::Dots(rig), Procedure::Response(own)) => response::foresee(lab, rig, &plan, own),
@@ -71,6 +77,27 @@ pub fn foresee(lab: &Lab<'_>, text: &str) -> Result<Foreseen, ConfigError> {
         check_mosaic(&plan, rig.file.camera.pixel_format)?;
     }
     Ok(foreseen)
+}
+
+/// Predicts a run with settings that were chosen for the calibration in use, `chosen` with their table, or else with the
+/// plan's own: a camera may not take those that suit the rig's rows.
+fn chosen_or<T>(
+    own: T,
+    chosen: Option<(T, String)>,
+    foresee: impl Fn(T) -> Result<Foreseen, ConfigError>,
+) -> Result<Foreseen, ConfigError> {
+    let Some((chosen, table)) = chosen else { return foresee(own) };
+    match foresee(chosen) {
+        Ok(foreseen) => Ok(foreseen.with_settings(table)),
+        Err(error) => {
+            let mut foreseen = foresee(own)?;
+            let warning = format!(
+                "the settings that suit the calibration in use cannot be taken, so the defaults of an uncalibrated rig are: {error}"
+            );
+            foreseen.report.warnings.push(warning);
+            Ok(foreseen)
+        }
+    }
 }
 
 fn of_another_rig(plan: &Plan, what: &str) -> ConfigError {

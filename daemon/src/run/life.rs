@@ -41,6 +41,14 @@ pub struct Foreseen {
     pub procedure: Box<dyn Measurement>,
 }
 
+impl Foreseen {
+    /// The same with the table of settings that were chosen because the plan states none.
+    pub fn with_settings(mut self, table: String) -> Self {
+        self.report.settings = Some(table);
+        self
+    }
+}
+
 /// The part of a run that differs between procedures.
 pub trait Measurement: Send {
     /// Adds what is computed only on request: a run must not wait for it.

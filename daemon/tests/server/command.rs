@@ -102,7 +102,12 @@ fn every_other_command_prints_for_people_and_for_programs() {
         (vec!["check", &plan], "relative rows -94 to 94", "/warnings/0"),
         (vec!["check", &plan], "assumed: state camera.electrons_per_dn", "/advice/noise/source"),
         (vec!["check", &plan], "0.023 (0.015 to 0.075); noise 0.023", "/advice/expected/total/median"),
-        (vec!["check", &plan], "warning    few points\n\n[sweep]\naverage = 8\n", "/advice/better/table"),
+        (
+            vec!["check", &plan],
+            "few points\n\n# the settings that are taken\n[sweep]\naverage = 4\n",
+            "/settings",
+        ),
+        (vec!["check", &plan], "\n# better settings\n[sweep]\naverage = 8\n", "/advice/better/table"),
         (vec!["design", &plan, "--light", "2s"], "# warning: not reached\nkind = \"sweep\"\n", "/plan"),
         (vec!["doctor"], "warning  vsync  2 false edges", "/checks/0/remedy"),
         (vec!["sessions"], "20260101-000000_fake  complete   75/75  fake", "/0/state"),

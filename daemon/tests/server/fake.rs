@@ -160,6 +160,7 @@ pub fn report() -> CheckReport {
         memory_free_bytes: 8_000_000_000,
         disk_bytes: 30 << 20,
         disk_free_bytes: 1 << 40,
+        settings: Some("[sweep]\naverage = 4\n".into()),
         reach_rows: Some((-94, 94)),
         condition: Some(1234.5),
         advice: Some(PlanAdvice {

@@ -3,6 +3,8 @@
 use serde::Deserialize;
 
 use super::Axis;
+use super::rows::{KnownRows, OwnRowEdges};
+use crate::Places;
 use crate::document::{Document, counted};
 use crate::whole::whole;
 
@@ -40,6 +42,13 @@ impl Default for FilmPlan {
     }
 }
 
+/// The settings of a calibrated rig whose edges are known: the delays above, in its rows.
+const EXPOSURE_ROWS: f64 = 27.0;
+const FAR_ROWS: [f64; 4] = [67.5, 45.0, 28.8, 18.9];
+const EDGES_ROWS: [f64; 3] = [-0.5, 0.5, 1.5];
+/// Those of a rig whose edges mislead: none lies within 3 rows of the pixel's own.
+const WIDE_ROWS: [f64; 7] = [67.5, 51.5, 37.5, 25.5, 16.5, 9.5, 4.5];
+
 /// Maximum number of cycles of a film: six hours at four per second.
 const MAX_CYCLES: u64 = 86_400;
 /// Maximum number of settings per cycle.
@@ -58,6 +67,27 @@ impl FilmPlan {
         format!(
             "[film]\ndelay_us = {delay_us}\nexposure_us = {exposure_us}\ncycles = {cycles}\nmax_jitter_us = {max_jitter_us}\n"
         )
+    }
+
+    /// The plan with the settings that suit a calibrated rig; `None` if it states settings itself (`places` are those of
+    /// its text).
+    pub fn chosen(&self, places: &Places, rows: KnownRows) -> Option<Self> {
+        if ["delay_us", "exposure_us"].into_iter().any(|key| places.has(&["film", key])) {
+            return None;
+        }
+        let exposure_us = rows.exposure_us(EXPOSURE_ROWS);
+        let of_rows = |far: &[f64], edges: &[f64]| -> Vec<f64> {
+            let far = far.iter().map(|&of| rows.exposure_us(of));
+            far.chain(edges.iter().map(|&edge| rows.opening_us(exposure_us, edge))).collect()
+        };
+        let side_us = match rows.own_row_edges {
+            OwnRowEdges::Divide => of_rows(&FAR_ROWS, &EDGES_ROWS),
+            OwnRowEdges::Mislead => of_rows(&WIDE_ROWS, &[]),
+        };
+        let mut delays_us: Vec<f64> =
+            side_us.into_iter().flat_map(|delay_us| [-delay_us, delay_us]).chain([0.0]).collect();
+        delays_us.sort_by(f64::total_cmp);
+        Some(Self { delay_us: Axis::of_values(delays_us), exposure_us, ..self.clone() })
     }
 
     pub(super) fn check(&self, document: &mut Document<'_>) {
@@ -87,11 +117,36 @@ impl FilmPlan {
 mod tests {
     use super::*;
     use crate::plan::tests::{documented, parse};
+    use crate::plan::with_tables;
     use crate::plan::{Plan, Procedure};
 
     fn film(plan: Plan) -> FilmPlan {
         let Procedure::Film(film) = plan.procedure else { panic!("{plan:?}") };
         film
+    }
+
+    #[test]
+    fn a_calibrated_rig_gets_edges_on_its_rows_only_where_they_tell_something() {
+        let chosen = |text: &str, own_row_edges| {
+            let plan = parse(text).unwrap();
+            let places = plan.places.clone();
+            film(plan).chosen(&places, KnownRows { row_time_us: 22.22, own_row_edges })
+        };
+        let text = "kind = \"film\"\n[film]\ncycles = 3\n";
+        let nearest_rows = |film: &FilmPlan| {
+            let edges = film
+                .delay_us
+                .values()
+                .into_iter()
+                .map(|us| (us.abs() - film.exposure_us / 2.0).abs() / 22.22);
+            edges.fold(f64::INFINITY, f64::min)
+        };
+        let divided = chosen(text, OwnRowEdges::Divide).unwrap();
+        assert!((nearest_rows(&divided) - 0.5).abs() < 0.001 && divided.cycles == 3);
+        let wide = chosen(text, OwnRowEdges::Mislead).unwrap();
+        assert!(nearest_rows(&wide) > 3.0 && wide.delay_us.len() == 15);
+        let stated = with_tables(text, &wide.to_toml()).unwrap();
+        assert_eq!((film(parse(&stated).unwrap()), chosen(&stated, OwnRowEdges::Divide)), (wide, None));
     }
 
     #[test]

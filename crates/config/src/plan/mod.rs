@@ -6,12 +6,14 @@ mod darks;
 mod film;
 mod patterns;
 mod response;
+mod rows;
 mod sweep;
 mod tables;
 mod viewfinder;
 
 use serde::Deserialize;
 use serde_json::Map;
+use toml_edit::{DocumentMut, Item, Table, TomlError};
 
 pub use self::batches::{BatchesPlan, PathPlan, PlanePlan, Shape};
 pub use self::calibration::CalibrationPlan;
@@ -19,6 +21,7 @@ pub use self::darks::DarksPlan;
 pub use self::film::FilmPlan;
 pub use self::patterns::{PatternPlan, PatternRefused, PatternsPlan};
 pub use self::response::ResponsePlan;
+pub use self::rows::{KnownRows, OwnRowEdges};
 pub use self::sweep::{Axis, GridPlan, SweepPlan};
 pub use self::tables::{ProductTable, StageTable, products_of_argument};
 pub use self::viewfinder::{ALIGN_NEEDS_TRIGGER, FinderSubject, FinderTrigger, ViewfinderPlan};
@@ -253,19 +256,49 @@ impl Plan {
     }
 }
 
-/// A plan's text with other tables, those of the text `tables`, in place of its own. Comments are lost.
+/// A plan's text with other tables, those of the text `tables`, in place of its own. Comments stay, except those in
+/// tables that get tables of their own, and those of keys that the other tables do not have.
 ///
 /// # Errors
 /// If one of the texts is not TOML.
 pub fn with_tables(text: &str, tables: &str) -> Result<String, ConfigError> {
-    let read = |text: &str| -> Result<toml::Table, ConfigError> {
-        text.parse().map_err(|error: toml::de::Error| {
+    let read = |text: &str| -> Result<DocumentMut, ConfigError> {
+        text.parse().map_err(|error: TomlError| {
             ConfigMistake { message: error.message().into(), field: None, span: error.span() }.into()
         })
     };
-    let mut plan = read(text)?;
-    plan.extend(read(tables)?);
-    Ok(plan.to_string())
+    let (mut plan, mut tables) = (read(text)?, read(tables)?);
+    for (key, table) in tables.clone().iter() {
+        let own = plan.get_mut(key).and_then(Item::as_table_mut).filter(|own| !own.is_dotted());
+        match (own, table.as_table()) {
+            (Some(own), Some(table)) if !table.iter().any(|(_, item)| item.is_array_of_tables()) => {
+                tables.remove(key);
+                replace_values(own, table);
+            }
+            _ => {
+                plan.remove(key);
+            }
+        }
+    }
+    let (plan, rest) = (plan.to_string(), tables.to_string());
+    Ok(if rest.trim().is_empty() { plan } else { format!("{}\n\n{rest}", plan.trim_end()) })
+}
+
+/// Gives a table the keys and values of another one.
+fn replace_values(own: &mut Table, other: &Table) {
+    own.retain(|key, _| other.contains_key(key));
+    for (key, item) in other {
+        match (own.get_mut(key).and_then(Item::as_value_mut), item.as_value()) {
+            (Some(own), Some(value)) => {
+                let decor = own.decor().clone();
+                *own = value.clone();
+                *own.decor_mut() = decor;
+            }
+            _ => {
+                own.insert(key, item.clone());
+            }
+        }
+    }
 }
 
 #[cfg(test)]
@@ -279,6 +312,27 @@ mod tests {
         let Procedure::Sweep(sweep) = other.procedure else { panic!("{other:?}") };
         assert_eq!(sweep, SweepPlan { average: 3, ..SweepPlan::default() });
         assert_eq!((other.name.as_str(), &other.stages), ("a", &Plan::parse(text).unwrap().stages));
+        let commented = "kind = \"sweep\" # why\n# The grid.\n[sweep]\naverage = 2 # few\n\n[[stage]]\nname = \"demux\"\n";
+        let (few, extra) =
+            ("[sweep]\naverage = 3\n", "\n[[sweep.extra]]\ndelay_us = [0]\nexposure_us = [1]\n");
+        assert_eq!(with_tables(commented, few).unwrap(), commented.replace('2', "3"));
+        for own in [
+            commented,
+            "kind = \"sweep\" # why\nsweep.average = 2\n",
+            "kind = \"sweep\" # why\nsweep = { average = 2 }\n",
+        ] {
+            for tables in [few.to_owned(), format!("{few}{extra}")] {
+                let text = with_tables(own, &tables).unwrap();
+                let Procedure::Sweep(found) = Plan::parse(&text).unwrap().procedure else { panic!("{text}") };
+                let Procedure::Sweep(wanted) =
+                    Plan::parse(&format!("kind = \"sweep\"\n{tables}")).unwrap().procedure
+                else {
+                    panic!()
+                };
+                assert_eq!(found, wanted, "{text}");
+                assert!(text.contains("# why"), "{text}");
+            }
+        }
     }
 
     pub(super) fn parse(text: &str) -> Result<Plan, ConfigError> {

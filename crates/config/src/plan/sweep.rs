@@ -6,10 +6,13 @@ use serde::Deserialize;
 use serde::de::value::{MapAccessDeserializer, SeqAccessDeserializer};
 use serde::de::{Deserializer, MapAccess, SeqAccess, Visitor};
 
+use super::rows::{KnownRows, OwnRowEdges};
+use crate::Places;
 use crate::document::{Document, counted};
 use crate::whole::whole;
 
-/// `[sweep]`: the grid of delays and exposures; the defaults are the paper's.
+/// `[sweep]`: the grid of delays and exposures; the defaults are the paper's, and on a calibrated rig those of
+/// [`SweepPlan::chosen`].
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SweepPlan {
@@ -167,6 +170,11 @@ impl fmt::Display for Axis {
     }
 }
 
+/// The settings of a calibrated rig: a grid of 60, and 15 whose opening edge steps over the pixel's own row.
+const DELAYS_ROWS: f64 = 67.5;
+const EXPOSURES_ROWS: [f64; 4] = [27.0, 36.0, 45.0, 54.0];
+const EDGES_ROWS: f64 = 3.5;
+
 /// Maximum number of values along an axis.
 const MAX_AXIS: u64 = 1024;
 /// Maximum number of points of a sweep.
@@ -180,6 +188,31 @@ impl SweepPlan {
         let Ok(mut document) = Document::parse("") else { return false };
         self.check(&mut document);
         document.finish(Some(())).is_ok()
+    }
+
+    /// The plan with the settings that suit a calibrated rig; `None` if it states settings itself (`places` are those of
+    /// its text), or the paper's suit.
+    pub fn chosen(&self, places: &Places, rows: KnownRows) -> Option<Self> {
+        let is_stated = |key| places.has(&["sweep", key]);
+        if ["delay_us", "exposure_us", "extra"].into_iter().any(is_stated)
+            || rows.own_row_edges == OwnRowEdges::Mislead
+        {
+            return None;
+        }
+        let exposures_us = EXPOSURES_ROWS.map(|of| rows.exposure_us(of));
+        let shortest_us = exposures_us[0];
+        let farthest_us = rows.exposure_us(DELAYS_ROWS);
+        let [first_us, last_us] = [-EDGES_ROWS, EDGES_ROWS].map(|edge| rows.opening_us(shortest_us, edge));
+        let edges = GridPlan {
+            delay_us: Axis::Range { start: first_us, stop: last_us, count: 15 },
+            exposure_us: Axis::List(vec![shortest_us]),
+        };
+        Some(Self {
+            delay_us: Axis::Range { start: -farthest_us, stop: farthest_us, count: 15 },
+            exposure_us: Axis::of_values(exposures_us.to_vec()),
+            extra: vec![edges],
+            ..self.clone()
+        })
     }
 
     /// The grids in the order of acquisition.
@@ -324,6 +357,31 @@ mod tests {
         assert_eq!((sweep.delay_us.values()[0], sweep.delay_us.values()[14]), (-1500.0, 1500.0));
         assert_eq!(sweep.exposure_us.values(), [600.0, 750.0, 900.0, 1050.0, 1200.0]);
         assert_eq!(parse("kind = \"sweep\"").unwrap().stages[0].name, "demux");
+    }
+
+    #[test]
+    fn a_calibrated_rig_gets_edges_on_its_rows_where_they_tell_something() {
+        use OwnRowEdges::{Divide, Mislead};
+        let sweep_of = |text: &str| {
+            let plan = parse(text).unwrap();
+            let Procedure::Sweep(sweep) = plan.procedure else { panic!("{plan:?}") };
+            (sweep, plan.places)
+        };
+        let chosen = |text: &str, row_time_us, own_row_edges| {
+            let (sweep, places) = sweep_of(text);
+            sweep.chosen(&places, KnownRows { row_time_us, own_row_edges })
+        };
+        let few = "kind = \"sweep\"\n[sweep]\naverage = 3\n";
+        let (edges, _) = sweep_of(include_str!("../../../../deploy/plans/edges.toml"));
+        let sweep = chosen(few, 22.22, Divide).unwrap();
+        assert_eq!(sweep, SweepPlan { average: 3, ..edges });
+        // What a session states is not chosen again.
+        let stated = crate::plan::with_tables(few, &sweep.to_toml()).unwrap();
+        assert_eq!((sweep_of(&stated).0, chosen(&stated, 14.8, Divide)), (sweep, None));
+        let settings = chosen(few, 14.8, Divide).unwrap().settings_us();
+        assert_eq!((settings[0], settings[60], settings.len()), ((-1000.0, 400.0), (148.2, 400.0), 75));
+        assert_eq!(chosen(few, 22.22, Mislead), None);
+        assert_eq!(chosen("kind = \"sweep\"\n[sweep]\nexposure_us = [600]\n", 22.22, Divide), None);
     }
 
     #[test]

@@ -41,7 +41,7 @@ const CYCLES_UNDER_WAY: usize = 4;
 struct FilmRun {
     rig: Arc<Rig>,
     camera: CameraCapabilities,
-    calibration: Option<KeptCalibration>,
+    calibration: Option<Arc<KeptCalibration>>,
     film: FilmTask,
     products: Vec<ProductSpec>,
     stages: Stages,
@@ -92,7 +92,7 @@ impl Measurement for FilmRun {
     }
 
     fn keep(&self, session: &Session) -> Result<(), RpcError> {
-        keep_calibration(self.calibration.as_ref(), session)
+        keep_calibration(self.calibration.as_deref(), session)
     }
 
     fn measure(self: Box<Self>, run: Run) -> Result<Ended, RunError> {

@@ -28,7 +28,7 @@ const UNITS_UNDER_WAY: usize = 8;
 /// Images under pictures on a rig.
 struct PatternsRun {
     rig: Arc<Rig>,
-    calibration: Option<KeptCalibration>,
+    calibration: Option<Arc<KeptCalibration>>,
     patterns: PatternsTask,
 }
 
@@ -56,7 +56,7 @@ pub fn foresee(
 
 impl Measurement for PatternsRun {
     fn keep(&self, session: &Session) -> Result<(), RpcError> {
-        keep_calibration(self.calibration.as_ref(), session)
+        keep_calibration(self.calibration.as_deref(), session)
     }
 
     fn measure(self: Box<Self>, mut run: Run) -> Result<Ended, RunError> {

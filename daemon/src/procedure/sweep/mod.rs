@@ -35,7 +35,7 @@ const UNITS_UNDER_WAY: usize = 8;
 /// A sweep on a rig.
 struct SweepRun {
     rig: Arc<Rig>,
-    calibration: Option<KeptCalibration>,
+    calibration: Option<Arc<KeptCalibration>>,
     camera: CameraCapabilities,
     sweep: SweepTask,
     processing: Processing,
@@ -95,7 +95,7 @@ impl Measurement for SweepRun {
     }
 
     fn keep(&self, session: &Session) -> Result<(), RpcError> {
-        keep_calibration(self.calibration.as_ref(), session)
+        keep_calibration(self.calibration.as_deref(), session)
     }
 
     fn measure(self: Box<Self>, run: Run) -> Result<Ended, RunError> {
