@@ -152,7 +152,11 @@ impl<F: Fn(&Design) -> Option<Usable> + Sync> Search<'_, F> {
                 break;
             }
         }
-        best.map(|best| self.refined(best)).transpose()
+        let Some(best) = best else { return Ok(None) };
+        let reaches = |proposal: &Proposal| proposal.foreseen.total.median <= error;
+        let refined = self.refined(best.clone())?;
+        // What suits hard scenes better may suit typical ones less.
+        Ok(Some(if reaches(&best) && !reaches(&refined) { best } else { refined }))
     }
 
     /// The best of the candidates of at most `frames` frames.
