@@ -368,6 +368,18 @@ fn a_calibration_of_other_devices_or_a_damaged_one_is_refused_unless_overridden(
         let message = refusal(&bench);
         assert!(message.contains("calibration.toml: light.linearity_per_dn"), "{message}");
     }
+    for (key, wrong) in [
+        ("row_time_us", "[nan, 0.0]"),
+        ("camera_row_time_us", "[-22.0, 0.0]"),
+        ("jitter_us", "[inf, 0.0]"),
+        ("response_width_sd", "-1.0"),
+    ] {
+        let line = text.lines().find(|line| line.starts_with(&format!("{key} = "))).unwrap();
+        let text = text.replace(&format!("\n{line}\n"), &format!("\n{key} = {wrong}\n"));
+        fs::write(current.join("calibration.toml"), text).unwrap();
+        let message = refusal(&bench);
+        assert!(message.contains(&format!(".{key} = ")), "{message}");
+    }
     fs::copy(first.session.join("calibration.toml"), current.join("calibration.toml")).unwrap();
     fs::remove_file(current.join("calibration.npz")).unwrap();
     std::os::unix::fs::symlink(first.session.join("calibration.npz"), current.join("calibration.npz"))

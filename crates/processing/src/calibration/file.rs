@@ -543,7 +543,7 @@ impl CalibrationHeader {
         Ok(Some(header))
     }
 
-    /// Checks that the rows and columns seen exist, and that the curve and the counts that saturate are possible.
+    /// Checks that the rows and columns seen exist, and that times, the curve and the counts that saturate are possible.
     fn check(&self) -> Result<(), String> {
         let columns = self.drawing.as_ref().and_then(|drawing| drawing.columns);
         if let Some(column) = columns.iter().flatten().find(|column| !(0.0..=1.0).contains(*column)) {
@@ -555,6 +555,24 @@ impl CalibrationHeader {
             return Err(format!(
                 "seen_rows = [{first}, {end}]: must be [first row, row after the last] of the {rows} projector rows"
             ));
+        }
+        let timing = &self.timing;
+        for (key, value) in [
+            ("timing.row_time_us", timing.row_time_us[0]),
+            ("timing.camera_row_time_us", timing.camera_row_time_us[0]),
+        ] {
+            if !(value > 0.0 && value.is_finite()) {
+                return Err(format!("{key} = [{value}, ..]: must be more than 0, in microseconds"));
+            }
+        }
+        for (key, value) in [
+            ("timing.jitter_us", timing.jitter_us[0]),
+            ("timing.latency_sd_us", timing.latency_sd_us),
+            ("light.response_width_sd", self.light.response_width_sd.unwrap_or(0.0)),
+        ] {
+            if !(value >= 0.0 && value.is_finite()) {
+                return Err(format!("{key} = {value}: must be 0 or more"));
+            }
         }
         if let Some(dn) = self.light.saturation_dn.filter(|dn| !(*dn > 0.0 && dn.is_finite())) {
             return Err(format!("light.saturation_dn = {dn}: must be more than 0, in counts"));
