@@ -220,6 +220,18 @@ fn a_calibration_that_was_interrupted_at_its_second_board_is_resumed_to_the_same
 }
 
 #[test]
+fn two_boards_that_respond_alike_prove_less_than_two_that_differ() {
+    let bench = Bench::new(&small(""));
+    let [alone, alike] = ["", "boards = 2\n"].map(|boards| {
+        let ended = bench.run(&format!("{}{boards}", quick()));
+        assert_eq!(ended.state, "complete", "{:?}", ended.error);
+        kept(&ended.session).header.light
+    });
+    assert_eq!(alike.response_of, Some(ResponseOf::BoardsAlike));
+    assert!(alike.response_width_sd >= alone.response_width_sd.map(|sd| 0.99 * sd));
+}
+
+#[test]
 fn what_a_lamp_leaves_is_not_taken_for_a_board() {
     let bench = Bench::new(&small("[sim.ambient]\nlevel = 0.0002\nflicker = 0.3\n"));
     let ended = bench.run(&format!("{}boards = 2\n", quick()));

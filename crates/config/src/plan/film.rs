@@ -87,7 +87,9 @@ impl FilmPlan {
         let mut delays_us: Vec<f64> =
             side_us.into_iter().flat_map(|delay_us| [-delay_us, delay_us]).chain([0.0]).collect();
         delays_us.sort_by(f64::total_cmp);
-        Some(Self { delay_us: Axis::of_values(delays_us), exposure_us, ..self.clone() })
+        let chosen = Self { delay_us: Axis::of_values(delays_us), exposure_us, ..self.clone() };
+        // Rounded values of very short rows may coincide.
+        Some(chosen).filter(Self::is_possible)
     }
 
     pub(super) fn check(&self, document: &mut Document<'_>) {

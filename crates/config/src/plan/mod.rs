@@ -256,8 +256,8 @@ impl Plan {
     }
 }
 
-/// A plan's text with other tables, those of the text `tables`, in place of its own. Comments stay, except those in
-/// tables that get tables of their own, and those of keys that the other tables do not have.
+/// A plan's text with other tables, those of the text `tables`, in place of its own. Comments stay, except those above and
+/// in tables that get tables of their own, and those of keys that the other tables do not have.
 ///
 /// # Errors
 /// If one of the texts is not TOML.

@@ -207,12 +207,14 @@ impl SweepPlan {
             delay_us: Axis::Range { start: first_us, stop: last_us, count: 15 },
             exposure_us: Axis::List(vec![shortest_us]),
         };
-        Some(Self {
+        let chosen = Self {
             delay_us: Axis::Range { start: -farthest_us, stop: farthest_us, count: 15 },
             exposure_us: Axis::of_values(exposures_us.to_vec()),
             extra: vec![edges],
             ..self.clone()
-        })
+        };
+        // Rounded values of very short rows may coincide.
+        Some(chosen).filter(Self::is_possible)
     }
 
     /// The grids in the order of acquisition.
@@ -381,6 +383,7 @@ mod tests {
         let settings = chosen(few, 14.8, Divide).unwrap().settings_us();
         assert_eq!((settings[0], settings[60], settings.len()), ((-1000.0, 400.0), (148.2, 400.0), 75));
         assert_eq!(chosen(few, 22.22, Mislead), None);
+        assert_eq!(chosen(few, 1.0, Divide), None, "exposures of 45 and 54 rows are the same");
         assert_eq!(chosen("kind = \"sweep\"\n[sweep]\nexposure_us = [600]\n", 22.22, Divide), None);
     }
 

@@ -154,9 +154,12 @@ pub enum ResponseOf {
     /// Of one board, which spreads light inside as a wider beam would.
     #[serde(rename = "beam and board")]
     BeamAndBoard,
-    /// Of the narrower one of two boards of different material.
+    /// Of the narrower one of two boards, which differ.
     #[serde(rename = "beam")]
     Beam,
+    /// Of the first of two boards that do not differ.
+    #[serde(rename = "boards alike")]
+    BoardsAlike,
 }
 
 impl ResponseOf {
@@ -166,7 +169,10 @@ impl ResponseOf {
             Self::BeamAndBoard => {
                 "of beam and board, which one board cannot tell apart (calibration.boards = 2)"
             }
-            Self::Beam => "of the beam, by two boards",
+            Self::Beam => "of the beam, by two boards that differ",
+            Self::BoardsAlike => {
+                "of the beam, if the two boards, which respond alike, are of different material"
+            }
         }
     }
 }

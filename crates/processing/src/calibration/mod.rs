@@ -117,7 +117,10 @@ impl BoardFindings {
         let responses = self.responses();
         // What the responses may contain of a board, as a second moment.
         let (response_of, of_board) = match second {
-            Some(Ok(second)) => (ResponseOf::Beam, second.comparison.resolution),
+            Some(Ok(SecondBoard { comparison, .. })) => match comparison.narrower {
+                Narrower::First | Narrower::Second => (ResponseOf::Beam, comparison.resolution),
+                Narrower::Neither => (ResponseOf::BoardsAlike, comparison.resolution.max(PAINT_ROWS.powi(2))),
+            },
             None | Some(Err(_)) => (ResponseOf::BeamAndBoard, PAINT_ROWS.powi(2)),
         };
         let width_sd = responses.width_sd().hypot(responses.widened_by(of_board));
