@@ -298,10 +298,10 @@ impl Runner {
             live: self.outlet(&dir),
             probes: self.probes.clone(),
         };
-        let Foreseen { procedure, shape, .. } = foreseen;
+        let Foreseen { procedure, shape, report, .. } = foreseen;
         let thread = thread::Builder::new()
             .name("run".into())
-            .spawn(move || conduct(procedure, run, shape.points()))
+            .spawn(move || conduct(procedure, run, shape.points(), report.settings_refused))
             .map_err(|error| {
                 RpcError::new(ErrorCode::Internal, format!("cannot start the run's thread: {error}"))
             })?;

@@ -16,10 +16,11 @@ use raysweep_processing::calibration::{
     CalibratedLight, CalibrationTask, KeptCalibration, ResponseOf, current_in,
 };
 use raysweep_processing::plane::KnownRig;
+use raysweep_proto::{Event, RunParams};
 use raysweep_session::film::TransportFilm;
 use raysweep_session::stack::{ArrayName, Contents};
 use raysweep_sim::PlaneRig;
-use raysweep_tests::{Bench, Ended, data, end_of, rig_text};
+use raysweep_tests::{Bench, Ended, data, end_of, next_event, rig_text};
 use raysweep_transport::plane::relative_rows;
 use raysweep_transport::quality::median_profile_error;
 
@@ -235,13 +236,11 @@ fn two_boards_that_respond_alike_prove_less_than_two_that_differ() {
 fn what_a_lamp_leaves_is_not_taken_for_a_board() {
     let bench = Bench::new(&small("[sim.ambient]\nlevel = 0.0002\nflicker = 0.3\n"));
     let ended = bench.run(&format!("{}boards = 2\n", quick()));
-    assert_eq!(ended.state, "complete", "{:?}", ended.error);
-    assert_eq!(kept(&ended.session).header.light.response_of, Some(ResponseOf::BeamAndBoard));
-    let page = fs::read_to_string(ended.session.join("report.html")).unwrap();
-    assert!(
-        page.contains("the second board: the room&#39;s light flickers")
-            || page.contains("the second board: the room's light flickers")
-    );
+    assert_eq!(ended.state, "faulted");
+    assert!(message(&ended).contains("the room's light flickers"), "{}", message(&ended));
+    assert!(message(&ended).contains("calibration.boards = 1"), "{}", message(&ended));
+    let (_, state) = ended.open();
+    assert!(state.missing_points() > 62, "the second board was not asked for");
 }
 
 #[test]
@@ -271,7 +270,7 @@ fn a_cancelled_calibration_leaves_the_one_in_use() {
     let bench = Bench::new(&small(""));
     let first = bench.run(&quick());
     let mut events = bench.runner.events();
-    let params = raysweep_proto::RunParams { plan: PLAN.into(), ..Default::default() };
+    let params = RunParams { plan: PLAN.into(), ..Default::default() };
     Control::run(&*bench.runner, params).unwrap();
     let _ = Control::cancel(&*bench.runner);
     let cancelled = end_of(&mut events);
@@ -477,6 +476,29 @@ fn a_plan_without_settings_gets_those_that_suit_the_calibration() {
         edges.fold(f64::INFINITY, f64::min)
     };
     assert!(near_rows(delays(0.0)) < 0.51 && near_rows(delays(5.0)) > 3.0);
+}
+
+#[test]
+fn settings_that_the_rig_cannot_take_are_replaced_and_the_run_says_so() {
+    let bench = Bench::new(&small(""));
+    assert_eq!(bench.run(&quick()).state, "complete");
+    let header = current_in(&bench.folder.path().join("sessions")).join("calibration.toml");
+    let text = fs::read_to_string(&header).unwrap();
+    let row_time = text.lines().find(|line| line.starts_with("row_time_us")).unwrap();
+    fs::write(&header, text.replace(row_time, "row_time_us = [5000.0, 0.001]")).unwrap();
+    let plan = "kind = \"sweep\"\n[sweep]\naverage = 1\n";
+    let report = bench.runner.check(plan).unwrap();
+    assert_eq!((report.settings, report.points), (None, 75));
+    let why = report.settings_refused.unwrap();
+    assert!(why.contains("the settings that suit the calibration in use cannot be taken"), "{why}");
+    let mut events = bench.runner.events();
+    bench.runner.run(RunParams { plan: plan.into(), ..RunParams::default() }).unwrap();
+    let (state, warnings) = loop {
+        if let Event::Finished { state, warnings, .. } = next_event(&mut events) {
+            break (state, warnings);
+        }
+    };
+    assert_eq!((state.as_str(), &warnings[0]), ("complete", &why));
 }
 
 /// A sensor whose wells are full at three quarters of the converter's range: samples beyond that are bounds, not light.

@@ -275,6 +275,10 @@ pub struct CheckReport {
     /// `None` for other plans.
     #[serde(default)]
     pub settings: Option<String>,
+    /// Why such settings are not taken, and those of an uncalibrated rig are instead; `None` if they are, or none were
+    /// chosen.
+    #[serde(default)]
+    pub settings_refused: Option<String>,
     /// First and last relative row that a plane rig's plan covers; `None` on a dot rig.
     #[serde(default)]
     pub reach_rows: Option<(i32, i32)>,

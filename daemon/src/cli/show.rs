@@ -212,7 +212,8 @@ pub(super) fn check(report: &CheckReport) -> String {
         rows.insert(1, ("pace", pace));
         rows.insert(2, ("dark", format!("{} frames before the first chirp", response.dark_frames)));
     }
-    rows.extend(report.warnings.iter().map(|warning| ("warning", warning.clone())));
+    let refused = report.settings_refused.iter();
+    rows.extend(refused.chain(&report.warnings).map(|warning| ("warning", warning.clone())));
     let better = report.advice.iter().filter_map(|advice| advice.better.as_ref());
     let chosen = report.settings.iter().map(|table| ("the settings that are taken", table));
     let tables = chosen.chain(better.map(|better| ("better settings", &better.table)));

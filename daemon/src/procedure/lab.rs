@@ -179,6 +179,7 @@ impl Room {
             disk_bytes,
             disk_free_bytes,
             settings: None,
+            settings_refused: None,
             reach_rows: None,
             condition: None,
             // Computed only on request: a run must not wait for it.

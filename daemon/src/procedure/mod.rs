@@ -87,17 +87,18 @@ fn chosen_or<T>(
     foresee: impl Fn(T) -> Result<Foreseen, ConfigError>,
 ) -> Result<Foreseen, ConfigError> {
     let Some((chosen, table)) = chosen else { return foresee(own) };
-    match foresee(chosen) {
-        Ok(foreseen) => Ok(foreseen.with_settings(table)),
-        Err(error) => {
-            let mut foreseen = foresee(own)?;
-            let warning = format!(
-                "the settings that suit the calibration in use cannot be taken, so the defaults of an uncalibrated rig are: {error}"
-            );
-            foreseen.report.warnings.push(warning);
-            Ok(foreseen)
+    let refused = match foresee(chosen) {
+        Ok(mut foreseen) => {
+            foreseen.report.settings = Some(table);
+            return Ok(foreseen);
         }
-    }
+        Err(error) => error,
+    };
+    let mut foreseen = foresee(own)?;
+    foreseen.report.settings_refused = Some(format!(
+        "the settings that suit the calibration in use cannot be taken, so the defaults of an uncalibrated rig are: {refused}"
+    ));
+    Ok(foreseen)
 }
 
 fn of_another_rig(plan: &Plan, what: &str) -> ConfigError {

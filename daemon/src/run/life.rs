@@ -41,14 +41,6 @@ pub struct Foreseen {
     pub procedure: Box<dyn Measurement>,
 }
 
-impl Foreseen {
-    /// The same with the table of settings that were chosen because the plan states none.
-    pub fn with_settings(mut self, table: String) -> Self {
-        self.report.settings = Some(table);
-        self
-    }
-}
-
 /// The part of a run that differs between procedures.
 pub trait Measurement: Send {
     /// Adds what is computed only on request: a run must not wait for it.
@@ -141,9 +133,9 @@ pub struct Ended {
     pub found: Vec<String>,
 }
 
-/// The run's thread: acquires, makes the results, and reports the end. Errors and panics never leave the daemon
-/// stuck.
-pub fn conduct(procedure: Box<dyn Measurement>, mut run: Run, points: usize) {
+/// The run's thread: acquires, makes the results, and reports the end, with a `warning` that was there before. Errors and
+/// panics never leave the daemon stuck.
+pub fn conduct(procedure: Box<dyn Measurement>, mut run: Run, points: usize, warning: Option<String>) {
     let (board, dir) = (run.board.clone(), run.session.dir().to_owned());
     tracing::info!(session = %dir.display(), resumed = run.is_resumed, "run begins");
     let mut damaged = None;
@@ -154,7 +146,7 @@ pub fn conduct(procedure: Box<dyn Measurement>, mut run: Run, points: usize) {
     let ended = catch_unwind(AssertUnwindSafe(measure))
         .unwrap_or_else(|panic| Err(RunError::Panicked(message_of(&*panic).to_owned())));
     let ended = ended.unwrap_or_else(|error| failed(&error, points, &dir));
-    let warnings = damaged.into_iter().chain(ended.warnings).collect();
+    let warnings = warning.into_iter().chain(damaged).chain(ended.warnings).collect();
     finish(Ended { warnings, ..ended }, &board, &dir);
 }
 

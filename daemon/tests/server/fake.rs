@@ -161,6 +161,7 @@ pub fn report() -> CheckReport {
         disk_bytes: 30 << 20,
         disk_free_bytes: 1 << 40,
         settings: Some("[sweep]\naverage = 4\n".into()),
+        settings_refused: None,
         reach_rows: Some((-94, 94)),
         condition: Some(1234.5),
         advice: Some(PlanAdvice {

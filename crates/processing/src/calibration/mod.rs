@@ -1,8 +1,12 @@
 //! Calibrates a plane rig from images of a white board.
 
+mod arrays;
+mod curve;
 mod drawing;
 mod file;
+mod header;
 mod images;
+mod pixels;
 mod report;
 mod task;
 
@@ -18,13 +22,16 @@ use raysweep_transport::plane::board::images::{MOST_BEND, Narrower, Responses};
 use raysweep_transport::plane::board::times::RowTimes;
 use raysweep_transport::plane::calibrate::FlyingSpot;
 
+pub use self::arrays::CalibrationArrays;
+pub use self::curve::MeasuredCurve;
 pub use self::drawing::{CalibratedDrawing, Scanning};
-pub use self::file::{
-    CalibratedAmbient, CalibratedFlicker, CalibratedLight, CalibrationArrays, CalibrationHeader,
-    KeptCalibration, Pair, ResponseOf, ValidFor, current_in,
+pub use self::file::{KeptCalibration, current_in};
+pub use self::header::{
+    CalibratedAmbient, CalibratedFlicker, CalibratedLight, CalibrationHeader, Pair, ResponseOf, ValidFor,
 };
-use self::file::{CalibratedTiming, SCHEMA};
-pub use self::images::{BoardImages, BoardPixels, CalibrationError, MeasuredCurve, SecondBoard};
+use self::header::{CalibratedTiming, SCHEMA};
+pub use self::images::{BoardImages, CalibrationError};
+pub use self::pixels::{BoardPixels, SecondBoard};
 pub use self::task::{BoardPicture, BoardPurpose, BoardView, CalibrationTask, WhichBoard};
 use crate::plane::{KnownRig, manifest};
 use crate::stored::{Asked, ProcessError, Processed, Stored};
@@ -67,11 +74,9 @@ impl BoardFindings {
         let (times, spot) = pixels.times(images)?;
         let second = match pixels.second_board(images) {
             // What the first board tells is as good without it.
-            Err(
-                error @ (CalibrationError::SecondBoard(_)
-                | CalibrationError::Elsewhere { .. }
-                | CalibrationError::Lamps),
-            ) => Some(Err(error)),
+            Err(error @ (CalibrationError::SecondBoard(_) | CalibrationError::Elsewhere { .. })) => {
+                Some(Err(error))
+            }
             second => second?.map(Ok),
         };
         Ok(Self { pixels, times, spot, second })
