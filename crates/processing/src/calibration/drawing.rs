@@ -3,7 +3,7 @@
 use raysweep_transport::plane::calibrate::{FlyingSpot, Scan};
 use serde::{Deserialize, Serialize};
 
-use super::file::median;
+use super::median::median;
 
 /// How the projector draws its rows.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

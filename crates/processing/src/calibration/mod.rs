@@ -6,6 +6,7 @@ mod drawing;
 mod file;
 mod header;
 mod images;
+mod median;
 mod pixels;
 mod report;
 mod task;

@@ -16,8 +16,8 @@ use raysweep_transport::plane::board::times::{
 use raysweep_transport::plane::calibrate::FlyingSpot;
 
 use super::curve::MeasuredCurve;
-use super::file::median;
 use super::images::{BoardImages, CalibrationError, MOST_AWAY_ROWS};
+use super::median::median;
 use super::task::{
     AMBIENT_US, BoardPicture, BoardPurpose, COLUMNS_PER_BLOCK, CalibrationTask, PASSES_GREY, ROWS_PER_BLOCK,
     WHOLE_US, WhichBoard,
