@@ -1,11 +1,12 @@
 //! `rig.toml` of a plane rig: its devices and their timing.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use raysweep_core::{PixelFormat, Raster};
 use serde::Deserialize;
 
-use super::aravis::AravisConfig;
+use super::aravis::{AravisConfig, SensorRegion};
 use super::v4l2::V4l2Config;
 use super::vsync::{VsyncDriver, VsyncSection};
 use super::{
@@ -134,6 +135,37 @@ impl CameraSection {
     /// Counts without light.
     pub fn black_dn(&self) -> f64 {
         self.black_dn.unwrap_or_else(|| default_black_dn(self.pixel_format))
+    }
+
+    /// What the file says of where on the sensor the pixels lie and of what they count, as keys and values: a calibration
+    /// holds for these pixels alone.
+    pub fn sensor_settings(&self) -> BTreeMap<String, String> {
+        let is_gain = |name: &str| name.to_ascii_lowercase().contains("gain");
+        match self.driver {
+            CameraDriver::Aravis => {
+                let AravisConfig { region, binning: [columns, rows], black_level, features, .. } =
+                    &self.aravis;
+                let region = region.map(|SensorRegion { x, y, width, height }| {
+                    ("region".to_owned(), format!("{width} x {height} from column {x} and row {y} on"))
+                });
+                let binning = ("binning".to_owned(), format!("{columns} x {rows}"));
+                let black_level = black_level.map(|level| ("black_level".to_owned(), level.to_string()));
+                let features = features.iter().filter_map(|feature| feature.split_once('='));
+                let gains = features
+                    .filter(|(name, _)| is_gain(name))
+                    .map(|(name, value)| (format!("features {}", name.trim()), value.trim().to_owned()));
+                let all = region.into_iter().chain([binning]).chain(black_level).chain(gains);
+                all.map(|(key, value)| (format!("camera.aravis.{key}"), value)).collect()
+            }
+            CameraDriver::V4l2 => {
+                let controls = self.v4l2.iter().flat_map(|v4l2| &v4l2.controls);
+                controls
+                    .filter(|(name, _)| is_gain(name))
+                    .map(|(name, value)| (format!("camera.v4l2.controls {name}"), value.to_string()))
+                    .collect()
+            }
+            CameraDriver::Sim => BTreeMap::new(),
+        }
     }
 }
 

@@ -68,6 +68,10 @@ pub struct ValidFor {
     pub period_us: f64,
     /// SHA-256 of the rig file.
     pub rig_sha256: String,
+    /// What the rig file says of where on the sensor the pixels lie and of what they count; `None` in files of earlier
+    /// versions, which do not say it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sensor: Option<BTreeMap<String, String>>,
 }
 
 /// Times, each with its standard deviation.
@@ -281,6 +285,7 @@ impl ValidFor {
             projector_rows: rig.projector.rows,
             period_us: rig.vsync.period_us,
             rig_sha256: sha256(rig_text.as_bytes()),
+            sensor: Some(rig.camera.sensor_settings()),
         }
     }
 
@@ -310,10 +315,53 @@ impl ValidFor {
             let (of, now) = (self.period_us, rig.vsync.period_us);
             return Err(format!("it is of a period of {of} us, and vsync.period_us is {now}"));
         }
-        Ok(())
+        let Some(of) = &self.sensor else { return Ok(()) };
+        let now = rig.camera.sensor_settings();
+        let stated = |settings: &BTreeMap<String, String>, key: &str| {
+            settings.get(key).cloned().unwrap_or_else(|| "not stated".to_owned())
+        };
+        match of.keys().chain(now.keys()).find(|key| of.get(*key) != now.get(*key)) {
+            Some(key) => Err(format!("{key} was {}, and is {}", stated(of, key), stated(&now, key))),
+            None => Ok(()),
+        }
     }
 }
 
 pub(super) fn sha256(bytes: &[u8]) -> String {
     Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pixels_elsewhere_on_the_sensor_or_of_another_gain_are_refused() {
+        let rig = |in_aravis: &str| {
+            let text = format!(
+                "kind = \"plane\"\n[camera]\ndriver = \"aravis\"\n[camera.aravis]\naddress = \"127.0.0.1\"\n{in_aravis}\
+                 [vsync]\ndriver = \"sim\"\nperiod_us = 16666.667\n[projector]\ndriver = \"sim\"\n[sim]\nbench = \"b.sock\"\n"
+            );
+            RigFile::parse(&text).unwrap()
+        };
+        let of = rig(
+            "region = { y = 8, width = 64, height = 96 }\nfeatures = [\"GammaEnable=0\", \"Gain = 3\"]\n",
+        );
+        let valid_for = ValidFor::new(&of, "", "some camera", (96, 64));
+        let refusal = |in_aravis: &str| valid_for.check(&rig(in_aravis), None).err();
+        let region = "region = { y = 8, width = 64, height = 96 }\n";
+        assert_eq!(refusal(&format!("{region}features = [\"Gain=3\"]\ntrigger_source = \"Line1\"\n")), None);
+        let gain = "camera.aravis.features Gain was 3, and is ";
+        assert_eq!(refusal(&format!("{region}features = [\"Gain=6\"]\n")).unwrap(), format!("{gain}6"));
+        assert_eq!(refusal(region).unwrap(), format!("{gain}not stated"));
+        let moved = "region = { y = 9, width = 64, height = 96 }\nfeatures = [\"Gain=3\"]\n";
+        assert_eq!(
+            refusal(moved).unwrap(),
+            "camera.aravis.region was 64 x 96 from column 0 and row 8 on, and is 64 x 96 from column 0 and row 9 on"
+        );
+        // Files of earlier versions do not say it.
+        let earlier = ValidFor { sensor: None, ..valid_for };
+        assert_eq!(earlier.check(&rig(""), None), Ok(()));
+    }
 }
