@@ -5,7 +5,7 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
 use clap::Subcommand;
-use raysweep_processing::calibration::{CalibratedAmbient, CalibrationHeader, KeptCalibration, Pair};
+use raysweep_processing::calibration::{CalibratedAmbient, KeptCalibration, Pair};
 use raysweep_proto::{CalibrationInfo, Client, Empty};
 use serde_json::json;
 
@@ -50,7 +50,7 @@ pub(super) fn calibration(
         CalibrationCommand::Show { session } => {
             let folder = session.map_or_else(|| in_use(socket), Ok)?;
             let kept = read(&folder)?;
-            printer.print(&json!(kept.header), |_| header(&kept.header))?;
+            printer.print(&json!(kept.header), |_| shown(&kept))?;
         }
         CalibrationCommand::List => {
             printer.print(&Client::connect(socket)?.calibrations()?, |found| list(found))?;
@@ -99,8 +99,11 @@ fn list(found: &[CalibrationInfo]) -> String {
 }
 
 /// The figures of a calibration with their units and standard deviations.
-fn figures(header: &CalibrationHeader) -> Vec<(&'static str, Pair)> {
-    let (timing, light) = (&header.timing, &header.light);
+fn figures(kept: &KeptCalibration) -> Vec<(&'static str, Pair)> {
+    let (timing, light) = (&kept.header.timing, &kept.header.light);
+    let width_rows = kept.arrays.response_width_rows();
+    let width = light.response_width_sd.map(|share| [width_rows, share * width_rows]);
+    let width = width.map(|width| ("width of the responses / rows", width));
     let figures = [
         ("projector row time / us", timing.row_time_us),
         ("camera row time / us", timing.camera_row_time_us),
@@ -113,10 +116,11 @@ fn figures(header: &CalibrationHeader) -> Vec<(&'static str, Pair)> {
     ];
     let curve =
         light.linearity_per_dn.map(|per_dn| ("curve: a of DN (1 + a DN) / 1e-6", per_dn.map(|it| it * 1e6)));
-    figures.into_iter().chain(curve).collect()
+    figures.into_iter().chain(width).chain(curve).collect()
 }
 
-fn header(header: &CalibrationHeader) -> String {
+fn shown(kept: &KeptCalibration) -> String {
+    let header = &kept.header;
     let valid_for = &header.valid_for;
     let [rows, columns] = valid_for.size;
     let [first, end] = header.timing.seen_rows;
@@ -135,15 +139,12 @@ fn header(header: &CalibrationHeader) -> String {
     if let Some(of) = header.light.response_of {
         text += &format!("responses  {}\n", of.text());
     }
-    for (name, pair) in figures(header) {
+    for (name, pair) in figures(kept) {
         // Writing to a string does not fail.
         let _ = writeln!(text, "{name:NAME_WIDTH$} {}", with_error(pair));
     }
     let [_, latency_sd] = rounded([0.0, header.timing.latency_sd_us]);
     let _ = write!(text, "{:NAME_WIDTH$} known to {latency_sd} us", "latency");
-    if let Some(sd) = header.light.response_width_sd {
-        let _ = write!(text, "\n{:NAME_WIDTH$} known to {:.1} %", "width of the responses", 100.0 * sd);
-    }
     if let Some(dn) = header.light.saturation_dn {
         let _ = write!(text, "\n{:NAME_WIDTH$} {dn:.0}", "pixels saturate from / DN");
     }
@@ -193,8 +194,8 @@ impl Comparison {
                 second.header.valid_for.projector_rows
             )));
         }
-        let of_second: BTreeMap<&str, Pair> = figures(&second.header).into_iter().collect();
-        let figures = figures(&first.header).into_iter().filter_map(|(name, [a, a_sd])| {
+        let of_second: BTreeMap<&str, Pair> = figures(second).into_iter().collect();
+        let figures = figures(first).into_iter().filter_map(|(name, [a, a_sd])| {
             let [b, b_sd] = of_second.get(name)?;
             Some((name, a, *b, (b - a) / a_sd.hypot(*b_sd)))
         });

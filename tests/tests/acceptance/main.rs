@@ -192,6 +192,11 @@ fn a_second_board_tells_the_beam_from_the_board() {
         let [(told, known)] = found_and_known(&rig, |bench, sim| [error_of_sweep(&bench.run(SWEEP), sim)]);
         println!("{scatter_rows} rows: {misled:.4} by one board, {told:.4} by two, {known:.4} known");
         assert!(told < MOST * known && misled > told);
+        // Widths add up as squares.
+        let [wide, narrow] = [&found, &rig.2].map(|kept| kept.arrays.response_width_rows());
+        let spread_rows = (wide.powi(2) - narrow.powi(2)).sqrt();
+        println!("{wide:.3} and {narrow:.3} rows wide, so the first board spreads by {spread_rows:.3} rows");
+        assert!((spread_rows / scatter_rows - 1.0).abs() < 0.1);
     }
 }
 
@@ -228,4 +233,31 @@ fn an_unknown_rig_sees_all_scenes_like_a_known_one() {
         }
     }
     assert!(worse.is_empty(), "more than {MOST} times the known rig's error:\n{}", worse.join("\n"));
+}
+
+/// Errors of plans without settings, which are chosen for the calibration: the tables of the documentation.
+#[test]
+#[ignore = "minutes; needs a folder of scenes"]
+fn plans_without_settings_on_rigs_of_all_kinds() {
+    println!("scene | spot | jitter | sweep: calibrated | known | film: calibrated | known");
+    for scene in scenes() {
+        for (spot, jitter_us) in ["uniform", "one-way", "bidirectional"]
+            .into_iter()
+            .flat_map(|spot| ["0.0", "1.0", "2.0", "5.0"].map(|jitter_us| (spot, jitter_us)))
+        {
+            let unknown = UNKNOWN.replace("JITTER", jitter_us);
+            let unknown =
+                unknown.replace("[sim.projector]\n", &format!("[sim.projector]\nspot = {spot:?}\n"));
+            let more = format!("{unknown}[sim.board]\nprojector_columns = [0.1, 0.6]\n");
+            let pairs = found_and_known(&calibrated(&scene, &more), |bench, sim| {
+                let film = bench.run("kind = \"film\"\n[film]\ncycles = 8\n");
+                [error_of_sweep(&bench.run("kind = \"sweep\"\n"), sim), error_of_film(&film, sim)]
+            });
+            println!(
+                "{} | {spot} | {jitter_us} us | {}",
+                scene.file_stem().unwrap().to_string_lossy(),
+                pairs.map(|(found, known)| format!("{found:.4} | {known:.4}")).join(" | ")
+            );
+        }
+    }
 }

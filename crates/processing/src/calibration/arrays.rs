@@ -2,12 +2,13 @@
 
 use std::io::Cursor;
 
-use ndarray::{Array1, Array2, Array3};
+use ndarray::{Array1, Array2, Array3, ArrayView1, Axis};
 use ndarray_npy::{NpzReader, NpzWriter};
 use raysweep_transport::plane::RESPONSE_ROWS;
 
 use super::drawing::CalibratedDrawing;
 use super::header::CalibrationHeader;
+use super::median::median;
 
 /// Room in `calibration.npz` for everything but maps and tables: names, headers, modes.
 const OTHER_BYTES: u64 = 4 << 20;
@@ -51,6 +52,18 @@ pub struct CalibrationArrays {
 }
 
 impl CalibrationArrays {
+    /// Width of the responses in projector rows: the root of their second central moment, at least that of a row; the
+    /// median over the pixels.
+    pub fn response_width_rows(&self) -> f64 {
+        let width = |shares: ArrayView1<f32>| {
+            let moment = |power: i32| -> f32 {
+                shares.iter().zip(0_u8..).map(|(share, row)| share * f32::from(row).powi(power)).sum()
+            };
+            (moment(2) - moment(1).powi(2)).max(1.0 / 12.0).sqrt()
+        };
+        median(self.response.lanes(Axis(0)).into_iter().map(width))
+    }
+
     pub(super) fn to_bytes(&self) -> Result<Vec<u8>, String> {
         let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
         let mut write = || {
