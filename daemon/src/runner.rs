@@ -297,11 +297,12 @@ impl Runner {
             board: self.board.clone(),
             live: self.outlet(&dir),
             probes: self.probes.clone(),
+            warnings: foreseen.report.settings_refused.into_iter().collect(),
         };
-        let Foreseen { procedure, shape, report, .. } = foreseen;
+        let Foreseen { procedure, shape, .. } = foreseen;
         let thread = thread::Builder::new()
             .name("run".into())
-            .spawn(move || conduct(procedure, run, shape.points(), report.settings_refused))
+            .spawn(move || conduct(procedure, run, shape.points()))
             .map_err(|error| {
                 RpcError::new(ErrorCode::Internal, format!("cannot start the run's thread: {error}"))
             })?;
@@ -564,6 +565,7 @@ impl Control for Runner {
             operator: session.operator,
             sample: session.sample,
             tags: session.tags,
+            warnings: session.warnings,
         });
         let unreadable = listing.unreadable.into_iter().map(|(dir, error)| SessionInfo {
             session: dir,
@@ -576,6 +578,7 @@ impl Control for Runner {
             operator: None,
             sample: None,
             tags: Vec::new(),
+            warnings: Vec::new(),
         });
         Ok(readable.chain(unreadable).collect())
     }

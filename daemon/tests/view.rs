@@ -20,6 +20,7 @@ use std::time::Duration;
 use nix::unistd::Uid;
 use raysweep_proto::Client;
 use raysweep_session::Session;
+use raysweep_session::ledger::{EndEntry, EndState, Entry};
 use raysweep_session::stack::ArrayName;
 use serde_json::{Value, json};
 
@@ -403,13 +404,18 @@ fn the_light_of_a_pixel_over_the_delays_is_that_of_the_stack() {
 }
 
 /// A run is checked, started, watched, paused, cancelled, resumed, finished; its report is opened; a viewfinder is worked;
-/// two sessions are compared; a run's questions are answered.
+/// two sessions are compared; a run's questions are answered; a session's warnings are read.
 #[test]
 fn the_page_works_in_a_real_browser() {
     let python = std::env::var("RAYSWEEP_PYTHON").expect(
         "RAYSWEEP_PYTHON names a Python with tests/python/requirements.txt: `cargo xtask test` makes one",
     );
     let lab = Lab::start();
+    let warned = lab.run(&SWEEP.replace("groove", "warned"));
+    let mut ledger = Session::open(&warned).unwrap().resume().unwrap();
+    let end = EndEntry::new(EndState::Complete, 26, 0, vec!["the rig has moved".into()]);
+    ledger.append(&Entry::End(end)).unwrap();
+    drop(ledger);
     let page = lab.view(None);
     let rig = RIG.replace("[projector]\ndriver = \"sim\"", "[projector]\ndriver = \"external\"");
     assert_ne!(rig, RIG);

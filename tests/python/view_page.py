@@ -137,6 +137,17 @@ def questions(page):
     expect(page.locator("#question")).to_be_hidden()
 
 
+def warnings(page):
+    """Reads the warnings of a session."""
+    page.goto(address)
+    page.click("#tab-sessions")
+    session = page.locator("#sessions li", has_text="warned")
+    expect(session).to_contain_text("complete · 1 warning")
+    session.locator(".choose").click()
+    expect(page.locator("#session .note.warn")).to_have_text("the rig has moved")
+    shot(page, "warnings")
+
+
 def many_tabs(context):
     """Tabs that are not seen hold none of the six connections that a browser has to an address."""
     tabs = [context.new_page() for _ in range(8)]
@@ -202,6 +213,7 @@ with sync_playwright() as playwright:
             first_visit(page)
             viewfinder(page)
             questions(page)
+            warnings(page)
             many_tabs(context)
         visit(page, f"{scheme}-{width}")
         context.close()

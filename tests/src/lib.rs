@@ -180,13 +180,17 @@ fn start(folder: &Path, probes: Probes) -> Runner {
     runner.unwrap_or_else(|error| panic!("{error}")).with_probes(probes)
 }
 
-/// Waits until the run ends.
+/// Waits until the run ends, and checks in every test that its session keeps its warnings.
 ///
 /// # Panics
 /// When the daemon's core stops first.
 pub fn end_of(events: &mut Receiver<Event>) -> Ended {
     loop {
-        if let Event::Finished { session, state, error, .. } = next_event(events) {
+        if let Event::Finished { session, state, error, warnings, .. } = next_event(events) {
+            // A full disk takes no last line.
+            let last =
+                Session::open(&session).and_then(|session| session.state()).ok().and_then(|state| state.end);
+            assert!(last.is_none_or(|end| end.warnings == warnings), "not those of the ledger: {warnings:?}");
             return Ended { session, state, error };
         }
     }

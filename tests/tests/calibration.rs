@@ -17,6 +17,7 @@ use raysweep_processing::calibration::{
 };
 use raysweep_processing::plane::KnownRig;
 use raysweep_proto::{Event, RunParams};
+use raysweep_session::Session;
 use raysweep_session::film::TransportFilm;
 use raysweep_session::stack::{ArrayName, Contents};
 use raysweep_sim::PlaneRig;
@@ -493,12 +494,16 @@ fn settings_that_the_rig_cannot_take_are_replaced_and_the_run_says_so() {
     assert!(why.contains("the settings that suit the calibration in use cannot be taken"), "{why}");
     let mut events = bench.runner.events();
     bench.runner.run(RunParams { plan: plan.into(), ..RunParams::default() }).unwrap();
-    let (state, warnings) = loop {
-        if let Event::Finished { state, warnings, .. } = next_event(&mut events) {
-            break (state, warnings);
+    let (session, state, warnings) = loop {
+        if let Event::Finished { session, state, warnings, .. } = next_event(&mut events) {
+            break (session, state, warnings);
         }
     };
     assert_eq!((state.as_str(), &warnings[0]), ("complete", &why));
+    assert_eq!(Session::open(&session).unwrap().state().unwrap().end.unwrap().warnings, warnings);
+    // Known before the run, and so in no section of the report's own.
+    let page = fs::read_to_string(session.join("report.html")).unwrap();
+    assert!(page.contains("Warnings of the run") && page.contains("cannot be taken"));
 }
 
 /// A sensor whose wells are full at three quarters of the converter's range: samples beyond that are bounds, not light.

@@ -16,6 +16,7 @@ use raysweep_pipeline::{Stage, StageError, Unit};
 use raysweep_processing::{Asked, ExportScope, Processed, export, process, process_asked};
 use raysweep_proto::{Event, ResumeParams, RunParams};
 use raysweep_session::integrity::{Audit, Damage};
+use raysweep_session::ledger::EndState;
 use raysweep_session::stack::ArrayName;
 use raysweep_session::{Session, list};
 use raysweep_tests::{Bench, data, dots, next_event, rig_text};
@@ -289,6 +290,21 @@ fn damage_is_refused_or_left_out_and_said_and_a_resumed_run_acquires_it_again() 
     let (_, audit) = Audit::of(&Session::open(&folder).unwrap()).unwrap();
     assert!(audit.damage.is_empty(), "{:?}", audit.damage);
     assert!(!fs::read_to_string(folder.join("manifest.json")).unwrap().contains("damaged"));
+}
+
+#[test]
+fn a_resumed_run_that_faults_keeps_what_it_said_of_damage() {
+    let bench = small_bench();
+    let folder = completed(&bench, SWEEP);
+    damage(&folder.join("stack.zarr/sum/c.3.0.0"));
+    // No product can be written, and no end of the run's own.
+    fs::remove_dir_all(folder.join("products")).unwrap();
+    fs::write(folder.join("products"), "").unwrap();
+    let resumed = bench.resume(&folder);
+    let end = resumed.open().1.end.unwrap();
+    assert_eq!((resumed.state.as_str(), end.state, end.error), ("faulted", EndState::Faulted, resumed.error));
+    let [warning] = &end.warnings[..] else { panic!("{:?}", end.warnings) };
+    assert!(warning.contains("1 of 14 stored images were damaged"), "{warning}");
 }
 
 #[test]

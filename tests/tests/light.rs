@@ -10,6 +10,7 @@ use ndarray::Array3;
 use ndarray_npy::NpzWriter;
 use raysweep::control::Control;
 use raysweep_proto::{Event, RunParams, RunState};
+use raysweep_session::Session;
 use raysweep_session::stack::ArrayName;
 use raysweep_tests::{Bench, dots, next_event, rig_text};
 
@@ -178,4 +179,6 @@ fn a_transport_that_does_not_explain_the_regular_image_is_warned_of_in_capitals(
     assert!(warnings.iter().any(|warning| warning.starts_with(capitals)), "{warnings:?}");
     assert!(fs::read_to_string(session.join("report.html")).unwrap().contains(capitals));
     assert_eq!(bench.runner.status().warnings, warnings);
+    assert_eq!(Session::open(&session).unwrap().state().unwrap().end.unwrap().warnings, warnings);
+    assert_eq!(bench.runner.sessions().unwrap()[0].warnings, warnings);
 }

@@ -135,6 +135,18 @@ fn every_picture_has_its_images_and_sessions_are_resumed_to_the_same_bits() {
 }
 
 #[test]
+fn what_makes_the_products_worse_is_in_the_ledger_when_it_ends() {
+    let bench = bench("v-groove");
+    let ended = bench.run(&plan("[300]", "[[pattern]]\nkind = \"checkerboard\"\n"));
+    let (session, state) = ended.open();
+    let warnings = state.end.unwrap().warnings;
+    let black = "the projector's black is not measured";
+    assert!(warnings.iter().any(|warning| warning.starts_with(black)), "{warnings:?}");
+    let page = fs::read_to_string(session.report_path()).unwrap();
+    assert_eq!(page.matches(black).count(), 1, "no warning is said twice");
+}
+
+#[test]
 fn points_that_fail_are_taken_again_under_their_own_picture() {
     let sim = "scene = \"v-groove\"\nscene_rows = 16\nscene_columns = 16\nseed = 5";
     let faults = "[sim.vsync]\nmissing = 0.02\nfalse_edges = 0.02\n[sim.camera]\ndropped = 0.03\nlate_frames_max = 2\n";

@@ -95,28 +95,45 @@ fn median(values: &mut [f32]) -> f32 {
     values.get(values.len() / 2).copied().unwrap_or(0.0)
 }
 
-/// Makes images, table, report and manifest; returns the problems.
-///
-/// # Errors
-/// When the session cannot be written.
-pub fn make(session: &Session, state: &State, task: &DarksTask, rig: &RigFile) -> Result<Vec<String>> {
-    let (stack, mut problems) = (session.stack()?, state.left_out());
-    let DarksPlan { exposure_us, hot_sigmas, .. } = &task.darks;
-    let mut levels = Vec::new();
-    for (index, exposure_us) in exposure_us.values().into_iter().enumerate() {
-        let images = [2 * index, 2 * index + 1].map(|image| read(&stack, state, image));
-        match images {
-            [Ok((a, frames)), Ok((b, _))] => levels.push(Level::of(exposure_us, [a, b], frames, *hot_sigmas)),
-            images => problems.extend(images.into_iter().filter_map(std::result::Result::err)),
+/// What stored dark images show.
+pub struct DarksFindings {
+    levels: Vec<Level>,
+    /// Images that cannot be used, and why.
+    pub problems: Vec<String>,
+}
+
+impl DarksFindings {
+    /// Evaluates the images that the ledger lists.
+    ///
+    /// # Errors
+    /// When the stack cannot be opened.
+    pub fn of(session: &Session, state: &State, task: &DarksTask) -> Result<Self> {
+        let (stack, mut problems) = (session.stack()?, state.left_out());
+        let DarksPlan { exposure_us, hot_sigmas, .. } = &task.darks;
+        let mut levels = Vec::new();
+        for (index, exposure_us) in exposure_us.values().into_iter().enumerate() {
+            let images = [2 * index, 2 * index + 1].map(|image| read(&stack, state, image));
+            match images {
+                [Ok((a, frames)), Ok((b, _))] => {
+                    levels.push(Level::of(exposure_us, [a, b], frames, *hot_sigmas));
+                }
+                images => problems.extend(images.into_iter().filter_map(std::result::Result::err)),
+            }
         }
+        Ok(Self { levels, problems })
     }
-    write_products(session, task, &levels)?;
-    durable::write(
-        &session.report_path(),
-        report(session, state, task, &levels, &problems).to_html()?.as_bytes(),
-    )?;
-    manifest::write(session, state, &task.task, rig)?;
-    Ok(problems)
+
+    /// Writes images, table, report and manifest.
+    ///
+    /// # Errors
+    /// When the session cannot be written.
+    pub fn write(&self, session: &Session, state: &State, task: &DarksTask, rig: &RigFile) -> Result<()> {
+        let Self { levels, problems } = self;
+        write_products(session, task, levels)?;
+        let page = report(session, state, task, levels, problems).to_html()?;
+        durable::write(&session.report_path(), page.as_bytes())?;
+        manifest::write(session, state, &task.task, rig)
+    }
 }
 
 /// The mean of an image's frames, or why it cannot be used.
@@ -242,9 +259,10 @@ pub fn process(
     let mut task = DarksTask::new(plan, darks, &stored.known(&rig)?);
     Arc::make_mut(&mut task.task).left_out = state.left_out();
     stored.check_contents(task.contents())?;
-    let problems = make(session, state, &task, &rig)?;
+    let findings = DarksFindings::of(session, state, &task)?;
+    findings.write(session, state, &task, &rig)?;
     let (report, points) = (session.report_path(), shape.points());
-    Ok(Processed { report, stored: state.stored_points(), points, problems })
+    Ok(Processed { report, stored: state.stored_points(), points, problems: findings.problems })
 }
 
 #[cfg(test)]

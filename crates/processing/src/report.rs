@@ -5,14 +5,33 @@ use raysweep_session::Session;
 use raysweep_session::ledger::State;
 use raysweep_session::report::{Block, NoteLevel, Report, Section, Table};
 
-/// The page of a session.
+/// The page of a session. Warnings of its run that no section says come first.
 pub(crate) fn page(
     session: &Session,
     state: &State,
     facts: Vec<(String, String)>,
     sections: Vec<Section>,
 ) -> Report {
+    let sections = warnings(state, &sections).into_iter().chain(sections).collect();
     Report { title: state.session.name.clone(), subtitle: subtitle(state, session), facts, sections }
+}
+
+/// What the run warned of, unless the sections say it.
+fn warnings(state: &State, sections: &[Section]) -> Option<Section> {
+    let is_said = |warning: &str| {
+        // The ledger has the beginning of a long one.
+        let beginning = warning.trim_end_matches('…');
+        let mut blocks = sections.iter().flat_map(|section| &section.blocks);
+        blocks.any(|block| matches!(block, Block::Note(_, text) if text.starts_with(beginning)))
+    };
+    let warnings = state.end.iter().flat_map(|end| &end.warnings).filter(|warning| !is_said(warning));
+    let blocks: Vec<_> = warnings.map(|text| Block::Note(NoteLevel::Warning, text.clone())).collect();
+    (!blocks.is_empty()).then(|| Section {
+        title: "Warnings of the run".into(),
+        intro: "What the run warned of when it ended; results that were made again since may be better."
+            .into(),
+        blocks,
+    })
 }
 
 /// Facts with fixed names.

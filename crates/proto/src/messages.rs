@@ -384,6 +384,9 @@ pub struct SessionInfo {
     /// Its tags.
     #[serde(default)]
     pub tags: Vec<String>,
+    /// Reasons why the results of its latest run may be worse than they look.
+    #[serde(default)]
+    pub warnings: Vec<String>,
 }
 
 /// One entry of `calibrations`.

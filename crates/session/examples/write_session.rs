@@ -103,17 +103,7 @@ fn acquire(
         }
     }
     store(ArrayName::Regular, 0, 16_666.0, 0.0, &scene.sum_axis(Axis(0)))?;
-    ledger.append(&Entry::End(EndEntry {
-        state: EndState::Complete,
-        error: None,
-        stored: shape.points(),
-        missing: 0,
-        vsync: None,
-        final_s: None,
-        light_s: None,
-        simulated_time: false,
-        settings_latency: None,
-    }))?;
+    ledger.append(&Entry::End(EndEntry::new(EndState::Complete, shape.points(), 0, Vec::new())))?;
     Ok(session)
 }
 

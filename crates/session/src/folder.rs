@@ -425,6 +425,8 @@ pub struct SessionSummary {
     pub stored: usize,
     /// How its latest run ended; `None` while one is running and after a crash.
     pub end: Option<EndState>,
+    /// Warnings of its latest run.
+    pub warnings: Vec<String>,
 }
 
 /// The sessions of a data folder.
@@ -456,6 +458,7 @@ pub fn list(root: &Path) -> Result<Listing> {
                 stored: state.stored_points(),
                 points: state.session.shape.points(),
                 end: state.end.as_ref().map(|end| end.state),
+                warnings: state.end.map_or_else(Vec::new, |end| end.warnings),
                 name: state.session.name,
                 kind: state.session.kind,
                 operator: state.session.operator,

@@ -174,7 +174,7 @@ pub enum Command {
     },
     /// List the daemon's sessions, oldest first
     Sessions(SessionFilter),
-    /// Show a session on one screen: settings, counts, findings, remarks and files
+    /// Show a session on one screen: settings, counts, warnings, findings, remarks and files
     Show {
         /// The session's folder, or its name within the daemon's data folder
         session: PathBuf,
@@ -182,7 +182,7 @@ pub enum Command {
         #[arg(long, value_name = "FOLDER")]
         thumbnails: Option<PathBuf>,
     },
-    /// Compare two sessions: settings, calibration, counts and products
+    /// Compare two sessions: settings, calibration, counts, warnings and products
     Diff {
         /// The first session's folder or name
         a: PathBuf,

@@ -8,6 +8,7 @@ use super::exit::Exit;
 use super::failure::CommandFailure;
 use super::plan_file::read_plan;
 use super::printer::Printer;
+use super::show::counted;
 use crate::control::Control;
 use crate::doctor::examine;
 use crate::rig::AnyRig;
@@ -92,8 +93,4 @@ pub fn text(report: &DoctorReport) -> String {
         (failures, warnings) => format!("{}, {}", counted(failures, "failure"), counted(warnings, "warning")),
     });
     lines.join("\n")
-}
-
-fn counted(count: usize, what: &str) -> String {
-    format!("{count} {what}{}", if count == 1 { "" } else { "s" })
 }

@@ -85,6 +85,7 @@ mod tests {
             operator: None,
             sample: None,
             tags: Vec::new(),
+            warnings: Vec::new(),
         }
     }
 

@@ -107,6 +107,8 @@ pub(super) struct SessionView {
     software: String,
     state: String,
     error: Option<String>,
+    /// Warnings of its latest run.
+    warnings: Vec<String>,
     stored: usize,
     points: usize,
     counts: Counts,
@@ -160,7 +162,8 @@ impl SessionView {
             stored,
             points,
             counts: state.counts,
-            light_s: end.and_then(|end| end.light_s),
+            light_s: end.as_ref().and_then(|end| end.light_s),
+            warnings: end.map_or_else(Vec::new, |end| end.warnings),
             // A damaged plan may be none any more.
             settings: match flat(&session, "plan.toml") {
                 Err(_) if !damage.is_empty() => BTreeMap::new(),
@@ -201,6 +204,7 @@ impl SessionView {
         }
         rows.push(("state", format!("{}: {} of {} points stored", self.state, self.stored, self.points)));
         rows.extend(self.error.iter().map(|error| ("error", error.clone())));
+        rows.extend(self.warnings.iter().map(|warning| ("warning", warning.clone())));
         rows.extend(self.damage.iter().map(|damage| ("DAMAGED", damage.clone())));
         let Counts { expected, averaged, .. } = self.counts;
         rows.push(("frames", format!("{averaged} used of {expected}, {}", self.counts.losses())));
@@ -248,6 +252,8 @@ pub(super) struct Compared {
     /// Points stored, of those planned.
     stored: [[usize; 2]; 2],
     counts: [Counts; 2],
+    /// Warnings of each session's latest run that the other's does not have.
+    warnings: [Vec<String>; 2],
     /// Products that both have, with the same shape.
     products: BTreeMap<String, Difference>,
     /// Products that only one of them has, or that have another shape.
@@ -293,7 +299,11 @@ impl Compared {
                 _ => unlike.push(name.clone()),
             }
         }
+        let only = |one: &SessionView, other: &SessionView| {
+            one.warnings.iter().filter(|warning| !other.warnings.contains(warning)).cloned().collect()
+        };
         Ok(Self {
+            warnings: [only(&first, &second), only(&second, &first)],
             damage: [first.damage, second.damage],
             settings: changes(a, b)?,
             picture: None,
@@ -325,6 +335,9 @@ impl Compared {
                     counts.losses()
                 ),
             ));
+        }
+        for (which, warnings) in ["A", "B"].iter().zip(&self.warnings) {
+            rows.extend(warnings.iter().map(|warning| ("warning", format!("only in {which}: {warning}"))));
         }
         title = "products";
         for (name, Difference { rms, rms_difference, largest }) in &self.products {
@@ -541,6 +554,7 @@ mod tests {
             operator: Some("Ada Lovelace".into()),
             sample: None,
             tags: vec!["a".into(), "b".into()],
+            warnings: Vec::new(),
         }
     }
 

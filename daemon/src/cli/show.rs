@@ -327,7 +327,11 @@ fn table_of(sessions: &[SessionInfo]) -> String {
         let folder = session.session.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let told = [session.operator.clone(), session.sample.clone(), Some(session.tags.join(", "))];
         let [operator, sample, tags] = told.map(Option::unwrap_or_default);
-        let row = [folder, session.state.clone(), points, session.name.clone(), operator, sample, tags];
+        let state = match session.warnings.len() {
+            0 => session.state.clone(),
+            count => format!("{}, {}", session.state, counted(count, "warning")),
+        };
+        let row = [folder, state, points, session.name.clone(), operator, sample, tags];
         // A line is a session, and columns are counted of what is printed.
         row.map(|cell| printable(&cell).replace('\n', "\\n"))
     };
@@ -490,6 +494,11 @@ pub(super) fn state(state: RunState) -> &'static str {
 
 fn name(session: &Path) -> String {
     session.file_name().unwrap_or(session.as_os_str()).to_string_lossy().into_owned()
+}
+
+/// A number of things.
+pub(super) fn counted(count: usize, what: &str) -> String {
+    format!("{count} {what}{}", if count == 1 { "" } else { "s" })
 }
 
 /// Seconds as hours, minutes and seconds.

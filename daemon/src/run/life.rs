@@ -90,6 +90,8 @@ pub struct Run {
     pub live: Option<Outlet>,
     /// What tests insert.
     pub probes: Probes,
+    /// Warnings from before it began; those of its end begin with them.
+    pub warnings: Vec<String>,
 }
 
 impl Run {
@@ -125,49 +127,51 @@ impl Run {
 
 /// How a run ended.
 pub struct Ended {
-    /// The ledger's entry.
+    /// The ledger's entry, which has the run's warnings.
     pub end: EndEntry,
-    /// Warnings for the operator.
-    pub warnings: Vec<String>,
     /// What the run found, beside its products, in a sentence each.
     pub found: Vec<String>,
 }
 
-/// The run's thread: acquires, makes the results, and reports the end, with a `warning` that was there before. Errors and
-/// panics never leave the daemon stuck.
-pub fn conduct(procedure: Box<dyn Measurement>, mut run: Run, points: usize, warning: Option<String>) {
+/// The run's thread: acquires, makes the results, and reports the end. Errors and panics never leave the daemon stuck.
+pub fn conduct(procedure: Box<dyn Measurement>, mut run: Run, points: usize) {
     let (board, dir) = (run.board.clone(), run.session.dir().to_owned());
     tracing::info!(session = %dir.display(), resumed = run.is_resumed, "run begins");
-    let mut damaged = None;
+    let mut warnings = run.warnings.clone();
     let measure = || {
-        damaged = run.leave_out_damage();
+        warnings.extend(run.leave_out_damage());
+        run.warnings.clone_from(&warnings);
         procedure.measure(run)
     };
     let ended = catch_unwind(AssertUnwindSafe(measure))
         .unwrap_or_else(|panic| Err(RunError::Panicked(message_of(&*panic).to_owned())));
-    let ended = ended.unwrap_or_else(|error| failed(&error, points, &dir));
-    let warnings = warning.into_iter().chain(damaged).chain(ended.warnings).collect();
-    finish(Ended { warnings, ..ended }, &board, &dir);
+    let ended = ended.unwrap_or_else(|error| failed(&error, points, &dir, warnings));
+    finish(ended, &board, &dir);
 }
 
-/// The end of a run that could not reach its own: also recorded in the ledger, so that the session does not look as if
-/// it were still under way.
-fn failed(error: &RunError, points: usize, dir: &Path) -> Ended {
-    let faulted = |stored, missing| EndEntry {
+/// The end of a run that could not reach its own, with the warnings from before it began: also recorded in the ledger, so
+/// that the session does not look as if it were still under way.
+fn failed(error: &RunError, points: usize, dir: &Path, mut warnings: Vec<String>) -> Ended {
+    let faulted = |stored, missing, warnings| EndEntry {
         error: Some(error.to_string()),
-        ..end_entry(EndState::Faulted, stored, missing)
+        ..EndEntry::new(EndState::Faulted, stored, missing, warnings)
     };
     let recorded = Session::open(dir).and_then(|session| freed(&session)).and_then(|mut ledger| {
-        let end = faulted(ledger.state().stored_points(), ledger.state().missing_points());
+        let state = ledger.state();
+        // An end that was recorded before the report failed has warnings of its own.
+        let known = state.end.iter().flat_map(|end| &end.warnings).filter(|known| !warnings.contains(known));
+        let known: Vec<String> = known.cloned().collect();
+        warnings.extend(known);
+        let end = faulted(state.stored_points(), state.missing_points(), warnings.clone());
         ledger.append(&Entry::End(end.clone())).map(|()| end)
     });
     let end = recorded.unwrap_or_else(|not_recorded| {
         tracing::warn!(error = %not_recorded, "the end of the run is not in the ledger");
         let stored = Session::open(dir).and_then(|session| session.state());
         let stored = stored.map_or(0, |state| state.stored_points());
-        faulted(stored, points.saturating_sub(stored))
+        faulted(stored, points.saturating_sub(stored), warnings)
     });
-    Ended { end, warnings: Vec::new(), found: Vec::new() }
+    Ended { end, found: Vec::new() }
 }
 
 /// The ledger of a run that has ended. After a panic, the run's other threads hold it until they have ended too.
@@ -184,7 +188,7 @@ fn freed(session: &Session) -> raysweep_session::Result<Ledger> {
 }
 
 /// Reports the end of a run.
-fn finish(Ended { end, warnings, found }: Ended, board: &StatusBoard, dir: &Path) {
+fn finish(Ended { end, found }: Ended, board: &StatusBoard, dir: &Path) {
     let state = if end.state == EndState::Faulted { RunState::Faulted } else { RunState::Idle };
     if let Some(error) = &end.error {
         tracing::error!(%error, session = %dir.display(), "run faulted");
@@ -200,7 +204,7 @@ fn finish(Ended { end, warnings, found }: Ended, board: &StatusBoard, dir: &Path
         stored: end.stored,
         missing: end.missing,
         film: board.status().film,
-        warnings,
+        warnings: end.warnings,
         found,
         final_s: end.final_s,
         light_s: end.light_s,
@@ -219,20 +223,5 @@ pub fn end_state(fault: Option<&RunError>, orders: &Orders) -> EndState {
         Some(_) => EndState::Faulted,
         None if orders.now() == Order::Cancel => EndState::Cancelled,
         None => EndState::Complete,
-    }
-}
-
-/// The end entry of a run without further results.
-pub fn end_entry(state: EndState, stored: usize, missing: usize) -> EndEntry {
-    EndEntry {
-        state,
-        error: None,
-        stored,
-        missing,
-        vsync: None,
-        final_s: None,
-        light_s: None,
-        simulated_time: false,
-        settings_latency: None,
     }
 }

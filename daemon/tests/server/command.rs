@@ -110,7 +110,7 @@ fn every_other_command_prints_for_people_and_for_programs() {
         (vec!["check", &plan], "\n# better settings\n[sweep]\naverage = 8\n", "/advice/better/table"),
         (vec!["design", &plan, "--light", "2s"], "# warning: not reached\nkind = \"sweep\"\n", "/plan"),
         (vec!["doctor"], "warning  vsync  2 false edges", "/checks/0/remedy"),
-        (vec!["sessions"], "20260101-000000_fake  complete   75/75  fake", "/0/state"),
+        (vec!["sessions"], "20260101-000000_fake  complete, 1 warning   75/75  fake", "/0/warnings/0"),
         (vec!["run", &plan, "--detach"], "/data/20260101-000000_fake", ""),
         (vec!["pause"], "pauses", ""),
         (vec!["status"], "to do      cover the lens", "/question/text"),

@@ -201,6 +201,7 @@ pub fn listed() -> SessionInfo {
         operator: Some("Ada".into()),
         sample: Some("candle".into()),
         tags: vec!["a".into()],
+        warnings: vec!["few frames".into()],
     }
 }
 

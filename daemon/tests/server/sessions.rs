@@ -9,7 +9,8 @@ use nix::sys::stat::Mode;
 use nix::unistd::mkfifo;
 use raysweep_session::Session;
 use raysweep_session::integrity::Audit;
-use serde_json::Value;
+use raysweep_session::ledger::{EndEntry, EndState, Entry};
+use serde_json::{Value, json};
 
 use crate::fake::Daemon;
 
@@ -210,6 +211,36 @@ fn two_sessions_are_compared_by_settings_and_by_their_images() {
     assert_eq!(width, 3 * one.ncols() + 2 * 4);
     let (exit, _, err) = run(&[&arguments[..], &["--product", "nothing"]].concat());
     assert!(exit == 2 && err.contains("no image nothing"), "{err}");
+}
+
+/// Notes a further end of a session's run, with these warnings.
+fn warn(session: &Path, warnings: &[&str]) {
+    let mut ledger = Session::open(session).unwrap().resume().unwrap();
+    let (stored, missing) = (ledger.state().stored_points(), ledger.state().missing_points());
+    let warnings = warnings.iter().map(|&warning| warning.to_owned()).collect();
+    let end = EndEntry::new(EndState::Complete, stored, missing, warnings);
+    ledger.append(&Entry::End(end)).unwrap();
+}
+
+#[test]
+fn the_warnings_of_a_run_are_shown_and_reported_and_those_of_one_session_alone_differ() {
+    let data = tempfile::tempdir().unwrap();
+    let (a, b) = (stored(data.path(), "a"), stored(data.path(), "b"));
+    assert!(!done(&["show", text(&a)]).contains("warning"));
+    warn(&a, &["the rig has moved", "few frames"]);
+    warn(&b, &["few frames", "too bright"]);
+    let shown = done(&["show", text(&a)]);
+    assert!(shown.contains("\nwarning    the rig has moved\nwarning    few frames\n"), "{shown}");
+    let shown: Value = serde_json::from_str(&done(&["show", text(&a), "--json"])).unwrap();
+    assert_eq!(shown["warnings"], json!(["the rig has moved", "few frames"]));
+    let said = done(&["diff", text(&a), text(&b)]);
+    let differ = "\nwarning    only in A: the rig has moved\nwarning    only in B: too bright";
+    assert!(said.contains(differ) && !said.contains("few frames"), "{said}");
+    let compared: Value = serde_json::from_str(&done(&["diff", text(&a), text(&b), "--json"])).unwrap();
+    assert_eq!(compared["warnings"], json!([["the rig has moved"], ["too bright"]]));
+    done(&["process", text(&a)]);
+    let page = fs::read_to_string(a.join("report.html")).unwrap();
+    assert!(page.contains("the rig has moved") && page.contains("few frames"));
 }
 
 #[test]

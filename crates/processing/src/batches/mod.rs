@@ -12,7 +12,7 @@ use raysweep_config::BatchesPlan;
 
 pub use self::columns::{from_stored, to_stored};
 pub use self::product::DotSpec;
-pub use self::results::{keep_patterns, make, write_manifest};
+pub use self::results::{BatchProducts, keep_patterns, make};
 pub use self::task::{CorrectOptions, DotTask, sampling};
 use crate::stored::{Asked, ProcessError, Processed, Stored};
 
@@ -35,12 +35,12 @@ pub fn process(stored: &Stored<'_>, batches: BatchesPlan, asked: &Asked) -> Resu
             specs.push(spec);
         }
     }
-    let problems = make(session, state, &task, &specs, Vec::new(), &|| true)?;
-    write_manifest(session, state, &task, &rig)?;
+    let products = make(session, state, &task, &specs, Vec::new(), &|| true)?;
+    products.write_report(session, state, &task, &rig)?;
     Ok(Processed {
         report: session.report_path(),
         stored: state.stored_points(),
         points: shape.points(),
-        problems,
+        problems: products.problems,
     })
 }

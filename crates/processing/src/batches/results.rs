@@ -23,7 +23,15 @@ use crate::video::Encoder;
 /// Number of images of a video in the report.
 const SHOWN: usize = 6;
 
-/// Makes the calibration, the videos and the report; returns the problems.
+/// What was made of stored batches.
+pub struct BatchProducts {
+    calibration: Option<Calibration>,
+    strips: Vec<VideoStrip>,
+    /// What could not be made, and what makes the products worse than they look.
+    pub problems: Vec<String>,
+}
+
+/// Makes the calibration and the videos; adds what fails to `problems`.
 ///
 /// # Errors
 /// When the session cannot be written.
@@ -34,7 +42,7 @@ pub fn make(
     specs: &[DotSpec],
     mut problems: Vec<String>,
     go_on: &dyn Fn() -> bool,
-) -> Result<Vec<String>> {
+) -> Result<BatchProducts> {
     let dots = session.dots()?;
     problems.extend(state.left_out());
     let calibration = Calibration::of(&dots, task, state, &mut problems);
@@ -97,9 +105,26 @@ pub fn make(
         strips.extend(of_video);
     }
     problems.append(&mut encoder.problems);
-    let page = report::make(session, state, task, calibration.as_ref(), &strips, &problems)?.to_html()?;
-    raysweep_session::durable::write(&session.report_path(), page.as_bytes())?;
-    Ok(problems)
+    Ok(BatchProducts { calibration, strips, problems })
+}
+
+impl BatchProducts {
+    /// Writes report and manifest, the last files of a session.
+    ///
+    /// # Errors
+    /// When the session cannot be written.
+    pub fn write_report(
+        &self,
+        session: &Session,
+        state: &State,
+        task: &DotTask,
+        rig: &DotRigFile,
+    ) -> Result<()> {
+        let Self { calibration, strips, problems } = self;
+        let page = report::make(session, state, task, calibration.as_ref(), strips, problems)?.to_html()?;
+        raysweep_session::durable::write(&session.report_path(), page.as_bytes())?;
+        write_manifest(session, state, task, rig)
+    }
 }
 
 /// Copies the lighting patterns of a plan into its session, so that its products can be made again from the session
@@ -184,11 +209,7 @@ fn common(task: &DotTask, state: &State) -> Map<String, Value> {
     entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
 }
 
-/// Writes the manifest, the last file of a session.
-///
-/// # Errors
-/// When the session cannot be written.
-pub fn write_manifest(session: &Session, state: &State, task: &DotTask, rig: &DotRigFile) -> Result<()> {
+fn write_manifest(session: &Session, state: &State, task: &DotTask, rig: &DotRigFile) -> Result<()> {
     let software = BTreeMap::from([("raysweep".to_owned(), env!("CARGO_PKG_VERSION").to_owned())]);
     let plan = &task.batches;
     let settings = json!({

@@ -36,61 +36,72 @@ struct SeparatedSeries {
     size_px: u32,
 }
 
-/// What is made of a session.
-struct Found {
+/// What was made of a session.
+pub struct PatternProducts {
     series: Vec<SeparatedSeries>,
     /// Light of the projector's black as a share of its white; `None`: not measured.
     black: Option<f64>,
-    problems: Vec<String>,
-    warnings: Vec<String>,
-}
-
-/// What is to be said of products that were made.
-pub struct Made {
     /// What could not be made, and why.
-    pub problems: Vec<String>,
+    problems: Vec<String>,
     /// What makes the products worse than they look.
-    pub warnings: Vec<String>,
+    shortcomings: Vec<String>,
 }
 
-/// Makes products, report and manifest.
-///
-/// # Errors
-/// When the session cannot be written.
-pub fn make(session: &Session, state: &State, task: &PatternsTask, rig: &RigFile) -> Result<Made> {
-    let stack = session.stack()?;
-    let images = PictureImages::new(task, state, &stack);
-    let mut found =
-        Found { series: Vec::new(), black: None, problems: state.left_out(), warnings: Vec::new() };
-    found.black = black(&images);
-    let boards = task.series().iter().filter(|(_, plan, _)| is_checkerboard(plan)).count();
-    for (name, plan, pictures) in task.series() {
-        let PatternPlan::Checkerboard { size_px, .. } = *plan else {
-            if let Err(problem) = write_captured(session, &images, &name, pictures)? {
-                found.problems.push(format!("{name}: {problem}"));
+impl PatternProducts {
+    /// Makes and writes them.
+    ///
+    /// # Errors
+    /// When the session cannot be written.
+    pub fn make(session: &Session, state: &State, task: &PatternsTask) -> Result<Self> {
+        let stack = session.stack()?;
+        let images = PictureImages::new(task, state, &stack);
+        let (black, mut problems, mut all_series) = (black(&images), state.left_out(), Vec::new());
+        let boards = task.series().iter().filter(|(_, plan, _)| is_checkerboard(plan)).count();
+        for (name, plan, pictures) in task.series() {
+            let PatternPlan::Checkerboard { size_px, .. } = *plan else {
+                if let Err(problem) = write_captured(session, &images, &name, pictures)? {
+                    problems.push(format!("{name}: {problem}"));
+                }
+                continue;
+            };
+            match separated(&images, size_px, pictures, black.unwrap_or(0.0)) {
+                Ok((separation, is_clipped)) => {
+                    let suffix = if boards > 1 {
+                        format!("-{}", name.trim_start_matches("checkerboard-"))
+                    } else {
+                        String::new()
+                    };
+                    let series = SeparatedSeries { suffix, separation, is_clipped, size_px };
+                    write_separated(session, task, &series, black)?;
+                    all_series.push(series);
+                }
+                Err(problem) => problems.push(format!("direct and global light by {name}: {problem}")),
             }
-            continue;
-        };
-        match separated(&images, size_px, pictures, found.black.unwrap_or(0.0)) {
-            Ok((separation, is_clipped)) => {
-                let suffix = if boards > 1 {
-                    format!("-{}", name.trim_start_matches("checkerboard-"))
-                } else {
-                    String::new()
-                };
-                found.series.push(SeparatedSeries { suffix, separation, is_clipped, size_px });
-            }
-            Err(problem) => found.problems.push(format!("direct and global light by {name}: {problem}")),
         }
+        let shortcomings = shortcomings(&all_series, black, boards);
+        Ok(Self { series: all_series, black, problems, shortcomings })
     }
-    found.warnings = warnings(&found, boards);
-    for series in &found.series {
-        write_separated(session, task, series, found.black)?;
+
+    /// What could not be made, and what makes the products worse than they look.
+    pub fn warnings(&self) -> impl Iterator<Item = &String> {
+        self.problems.iter().chain(&self.shortcomings)
     }
-    let page = report::make(session, state, task, &found).to_html()?;
-    durable::write(&session.report_path(), page.as_bytes())?;
-    manifest::write(session, state, &task.task, rig)?;
-    Ok(Made { problems: found.problems, warnings: found.warnings })
+
+    /// Writes report and manifest.
+    ///
+    /// # Errors
+    /// When the session cannot be written.
+    pub fn write_report(
+        &self,
+        session: &Session,
+        state: &State,
+        task: &PatternsTask,
+        rig: &RigFile,
+    ) -> Result<()> {
+        let page = report::make(session, state, task, self).to_html()?;
+        durable::write(&session.report_path(), page.as_bytes())?;
+        manifest::write(session, state, &task.task, rig)
+    }
 }
 
 fn is_checkerboard(plan: &PatternPlan) -> bool {
@@ -138,12 +149,12 @@ fn separated(
 }
 
 /// What makes the products worse than they look.
-fn warnings(found: &Found, boards: usize) -> Vec<String> {
+fn shortcomings(all_series: &[SeparatedSeries], black: Option<f64>, boards: usize) -> Vec<String> {
     let mut warnings = Vec::new();
-    if found.black.is_none() && boards > 0 {
+    if black.is_none() && boards > 0 {
         warnings.push("the projector's black is not measured, and is taken for dark: add a [[pattern]] of kind \"white\" and one of kind \"black\"".to_owned());
     }
-    for SeparatedSeries { separation, is_clipped, size_px, .. } in &found.series {
+    for SeparatedSeries { separation, is_clipped, size_px, .. } in all_series {
         let share = |marked: &Array2<bool>| {
             marked.iter().filter(|marked| **marked).count() as f64 / marked.len().max(1) as f64
         };
@@ -349,7 +360,8 @@ pub fn process(
         PatternsTask::new(plan, patterns, &stored.known(&rig)?).map_err(|error| stored.in_plan(&error))?;
     stored.check_points(task.contents(), &task.task)?;
     Arc::make_mut(&mut task.task).left_out = state.left_out();
-    let Made { problems, .. } = make(session, state, &task, &rig)?;
+    let products = PatternProducts::make(session, state, &task)?;
+    products.write_report(session, state, &task, &rig)?;
     let (report, points) = (session.report_path(), shape.points());
-    Ok(Processed { report, stored: state.stored_points(), points, problems })
+    Ok(Processed { report, stored: state.stored_points(), points, problems: products.problems })
 }

@@ -8,21 +8,27 @@ use raysweep_session::stack::ArrayName;
 use raysweep_transport::plane::separation::Separated;
 
 use super::task::REGULAR;
-use super::{Found, PatternsTask, SeparatedSeries};
+use super::{PatternProducts, PatternsTask, SeparatedSeries};
 use crate::plane::report::{jitter, settings};
 use crate::report::{accounts, named, page};
 
 /// The page.
-pub(super) fn make(session: &Session, state: &State, task: &PatternsTask, found: &Found) -> Report {
+pub(super) fn make(
+    session: &Session,
+    state: &State,
+    task: &PatternsTask,
+    products: &PatternProducts,
+) -> Report {
+    let PatternProducts { series, black, problems, shortcomings } = products;
     let mut sections = Vec::new();
     let note = |level, texts: &[String]| {
         texts.iter().map(|text| Block::Note(level, text.clone())).collect::<Vec<_>>()
     };
-    let notes = [note(NoteLevel::Error, &found.problems), note(NoteLevel::Warning, &found.warnings)].concat();
+    let notes = [note(NoteLevel::Error, problems), note(NoteLevel::Warning, shortcomings)].concat();
     if !notes.is_empty() {
         sections.push(section("Problems", "", notes));
     }
-    sections.extend(found.series.iter().map(|series| separation(task, series, found.black)));
+    sections.extend(series.iter().map(|series| separation(task, series, *black)));
     sections.push(section("Settings", "", vec![settings(state, &task.task)]));
     let deviations: Vec<f64> = task
         .task

@@ -117,10 +117,8 @@ impl Results {
     }
 
     /// What could not be made, and what makes the products worse than they look.
-    pub fn into_warnings(self) -> Vec<String> {
-        let mut warnings = self.problems;
-        warnings.extend(self.summary.into_iter().flat_map(|summary| summary.warnings));
-        warnings
+    pub fn warnings(&self) -> impl Iterator<Item = &String> {
+        self.problems.iter().chain(self.summary.iter().flat_map(|summary| &summary.warnings))
     }
 }
 

@@ -237,6 +237,42 @@ pub struct EndEntry {
     /// Latency of the camera's settings, if a probe measured it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub settings_latency: Option<SettingsLatency>,
+    /// Reasons why the results may be worse than they look.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub warnings: Vec<String>,
+}
+
+/// Most warnings of a run that are kept.
+const MOST_WARNINGS: usize = 100;
+/// Most characters of such a warning.
+const MOST_CHARACTERS: usize = 1000;
+
+impl EndEntry {
+    /// The end of a run of which only its points and warnings are known. Of very many warnings the first are kept, and
+    /// of very long ones the beginning.
+    pub fn new(state: EndState, stored: usize, missing: usize, warnings: Vec<String>) -> Self {
+        let more = warnings.len().saturating_sub(MOST_WARNINGS);
+        let more = (more > 0).then(|| format!("{more} more warnings of this run are not kept"));
+        Self {
+            state,
+            error: None,
+            stored,
+            missing,
+            vsync: None,
+            final_s: None,
+            light_s: None,
+            simulated_time: false,
+            settings_latency: None,
+            warnings: warnings.into_iter().take(MOST_WARNINGS).map(shortened).chain(more).collect(),
+        }
+    }
+}
+
+fn shortened(text: String) -> String {
+    match text.char_indices().nth(MOST_CHARACTERS) {
+        Some((end, _)) => format!("{}…", &text[..end]),
+        None => text,
+    }
 }
 
 /// Final state of a run.

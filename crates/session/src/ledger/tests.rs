@@ -51,18 +51,7 @@ fn failed(index: usize, attempt: u32) -> Entry {
 }
 
 fn end(state: EndState) -> Entry {
-    let (vsync, final_s, light_s, settings_latency) = (None, None, None, None);
-    Entry::End(EndEntry {
-        state,
-        error: None,
-        stored: 1,
-        missing: 3,
-        vsync,
-        final_s,
-        light_s,
-        simulated_time: false,
-        settings_latency,
-    })
+    Entry::End(EndEntry::new(state, 1, 3, vec!["the room's light \"flickers\"".into()]))
 }
 
 fn all_kinds() -> Vec<Entry> {
@@ -262,6 +251,19 @@ fn a_new_run_reopens_an_ended_session() {
     assert_eq!(ledger.state().end.as_ref().unwrap().state, EndState::Cancelled);
     ledger.append(&Entry::Run { started, resumed: true }).unwrap();
     assert_eq!((ledger.state().runs, ledger.state().end.as_ref()), (1, None));
+}
+
+#[test]
+fn warnings_are_kept_up_to_a_number_and_a_length_and_older_ends_have_none() {
+    let kept = |warnings| EndEntry::new(EndState::Complete, 4, 0, warnings).warnings;
+    let many = kept((0..130).map(|number| format!("warning {number}")).collect());
+    assert_eq!(many.len(), 101);
+    assert_eq!(many[99..], ["warning 99", "30 more warnings of this run are not kept"]);
+    assert_eq!(kept(vec!["é".repeat(5000)]), ["é".repeat(1000) + "…"]);
+    let older = r#"{"event":"end","state":"complete","stored":4,"missing":0}"#;
+    let read: Entry = serde_json::from_str(older).unwrap();
+    assert_eq!(read, Entry::End(EndEntry::new(EndState::Complete, 4, 0, Vec::new())));
+    assert_eq!(serde_json::to_string(&read).unwrap(), older);
 }
 
 #[test]

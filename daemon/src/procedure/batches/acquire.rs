@@ -36,7 +36,7 @@ pub struct Acquired {
     pub session: Session,
     /// Its ledger, still locked.
     pub ledger: Ledger,
-    /// Problems with single dots and batches.
+    /// Warnings from before the run began, and problems with single dots and batches.
     pub problems: Vec<String>,
     /// The fault that ended acquisition early, if any.
     pub fault: Option<RunError>,
@@ -112,6 +112,7 @@ pub fn acquire(
     let StoredBatches { ledger, problems, error } = storage.finish()?;
     let final_s = last_frame.map(|last| last.elapsed().as_secs_f64());
     let fault = error.map(RunError::from).or(passed.err());
+    let problems = [run.warnings, problems].concat();
     Ok(Acquired { session: run.session, ledger, problems, fault, final_s })
 }
 

@@ -7,7 +7,7 @@ mod sink;
 use std::sync::Arc;
 
 use raysweep_config::{BatchesPlan, ConfigError, Plan};
-use raysweep_processing::batches::{DotTask, keep_patterns, make, write_manifest};
+use raysweep_processing::batches::{DotTask, keep_patterns, make};
 use raysweep_proto::{ErrorCode, RpcError};
 use raysweep_session::Session;
 use raysweep_session::ledger::{EndEntry, EndState, Entry};
@@ -19,7 +19,7 @@ use crate::probes::Probes;
 use crate::procedure::lab::Lab;
 use crate::rig::{DotRig, Pace};
 use crate::run::error::RunError;
-use crate::run::life::{Ended, Foreseen, Measurement, Run, end_entry, end_state};
+use crate::run::life::{Ended, Foreseen, Measurement, Run, end_state};
 
 /// A run of batches on a rig.
 struct BatchesRun {
@@ -78,19 +78,24 @@ impl Measurement for BatchesRun {
         let orders = run.orders.clone();
         let Acquired { session, mut ledger, mut problems, fault, final_s } =
             acquire(&rig, &task, &probes, run)?;
-        let stored = ledger.state().stored_points();
         let state = end_state(fault.as_ref(), &orders);
+        let mut products = None;
+        if state == EndState::Complete {
+            let go_on = || orders.go_on();
+            let made = make(&session, ledger.state(), &task, &task.specs, problems, &go_on)?;
+            problems = made.problems.clone();
+            products = Some(made);
+        }
+        let stored = ledger.state().stored_points();
         let end = EndEntry {
             error: fault.map(|fault| fault.to_string()),
             final_s,
-            ..end_entry(state, stored, ledger.state().missing_points())
+            ..EndEntry::new(state, stored, ledger.state().missing_points(), problems)
         };
         ledger.append(&Entry::End(end.clone()))?;
-        if state == EndState::Complete {
-            let go_on = || orders.go_on();
-            problems = make(&session, ledger.state(), &task, &task.specs, problems, &go_on)?;
-            write_manifest(&session, ledger.state(), &task, &rig.file)?;
+        if let Some(products) = products {
+            products.write_report(&session, ledger.state(), &task, &rig.file)?;
         }
-        Ok(Ended { end, warnings: problems, found: Vec::new() })
+        Ok(Ended { end, found: Vec::new() })
     }
 }

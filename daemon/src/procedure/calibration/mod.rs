@@ -22,7 +22,7 @@ use crate::plane::{Opened, Passes, PointSink, Taken, missing};
 use crate::procedure::lab::{Lab, RigOfRun};
 use crate::rig::Rig;
 use crate::run::error::RunError;
-use crate::run::life::{Ended, Foreseen, Measurement, Run, end_entry, end_state};
+use crate::run::life::{Ended, Foreseen, Measurement, Run, end_state};
 use crate::run::progress::ProgressMeter;
 
 /// Capacity of the queue of images between the assembler and the disk.
@@ -176,7 +176,7 @@ impl Measurement for CalibrationRun {
             Ok(())
         })?;
         let Taken { sink: PointSink { run, vsync, write_error, .. }, exposures, latency, fault } = taken;
-        let Run { session, mut ledger, orders, .. } = run;
+        let Run { session, mut ledger, orders, mut warnings, .. } = run;
         let mut fault = write_error.map(RunError::from).or(fault);
         let mut found = None;
         if let (None, Some(pixels)) = (&fault, pixels) {
@@ -191,6 +191,7 @@ impl Measurement for CalibrationRun {
             (EndState::Complete, None) => EndState::Faulted,
             (state, _) => state,
         };
+        warnings.extend(found.iter().flat_map(BoardFindings::warnings));
         let stored = ledger.state().stored_points();
         let end = EndEntry {
             error: fault.map(|fault| fault.to_string()),
@@ -198,18 +199,18 @@ impl Measurement for CalibrationRun {
             light_s: exposures.light_s(),
             simulated_time: exposures.is_simulated,
             settings_latency: latency,
-            ..end_entry(state, stored, ledger.state().missing_points())
+            ..EndEntry::new(state, stored, ledger.state().missing_points(), warnings)
         };
         ledger.append(&Entry::End(end.clone()))?;
-        let (mut warnings, mut said) = (Vec::new(), Vec::new());
+        let mut said = Vec::new();
         if let Some(found) = found {
             let size = (task.geometry.height, task.geometry.width);
             let valid_for = ValidFor::new(&rig.file, &rig.text, &camera, size);
             let kept = found.keep(&session, ledger.state(), valid_for)?;
             found.write(&kept, &session, ledger.state(), &calibration, &rig.file)?;
             kept.use_in(&data)?;
-            (warnings, said) = (found.warnings(), found.found());
+            said = found.found();
         }
-        Ok(Ended { end, warnings, found: said })
+        Ok(Ended { end, found: said })
     }
 }

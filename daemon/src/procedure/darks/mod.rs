@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use raysweep_config::plan::DarksPlan;
 use raysweep_config::{ConfigError, Plan};
-use raysweep_processing::darks::{DarksTask, make};
+use raysweep_processing::darks::{DarksFindings, DarksTask};
 use raysweep_processing::plane::Processing;
 use raysweep_session::ledger::{EndEntry, EndState, Entry};
 use raysweep_session::stack::StackShape;
@@ -15,7 +15,7 @@ use crate::plane::{Opened, PointSink, Taken, missing};
 use crate::procedure::lab::{Lab, RigOfRun};
 use crate::rig::Rig;
 use crate::run::error::RunError;
-use crate::run::life::{Ended, Foreseen, Measurement, Run, end_entry, end_state};
+use crate::run::life::{Ended, Foreseen, Measurement, Run, end_state};
 use crate::run::progress::ProgressMeter;
 
 /// Capacity of the queue of images between the assembler and the disk.
@@ -63,22 +63,24 @@ impl Measurement for DarksRun {
         let taken =
             opened.acquire(stages, UNITS_UNDER_WAY, sink, &results, |passes| passes.acquire(missing))?;
         let Taken { sink: PointSink { run, vsync, write_error, .. }, latency, fault, .. } = taken;
-        let Run { session, mut ledger, orders, .. } = run;
+        let Run { session, mut ledger, orders, mut warnings, .. } = run;
         let fault = write_error.map(RunError::from).or(fault);
         let state = end_state(fault.as_ref(), &orders);
+        let findings = (state == EndState::Complete)
+            .then(|| DarksFindings::of(&session, ledger.state(), &darks))
+            .transpose()?;
+        warnings.extend(findings.iter().flat_map(|findings| findings.problems.clone()));
         let stored = ledger.state().stored_points();
-        let error = fault.map(|fault| fault.to_string());
         let end = EndEntry {
-            error,
+            error: fault.map(|fault| fault.to_string()),
             vsync,
             settings_latency: latency,
-            ..end_entry(state, stored, ledger.state().missing_points())
+            ..EndEntry::new(state, stored, ledger.state().missing_points(), warnings)
         };
         ledger.append(&Entry::End(end.clone()))?;
-        let warnings = match state {
-            EndState::Complete => make(&session, ledger.state(), &darks, &rig.file)?,
-            EndState::Cancelled | EndState::Faulted => Vec::new(),
-        };
-        Ok(Ended { end, warnings, found: Vec::new() })
+        if let Some(findings) = findings {
+            findings.write(&session, ledger.state(), &darks, &rig.file)?;
+        }
+        Ok(Ended { end, found: Vec::new() })
     }
 }

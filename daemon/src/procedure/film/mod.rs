@@ -30,7 +30,7 @@ use crate::plane::{Opened, PointSink, Taken, missing};
 use crate::procedure::lab::{Lab, RigOfRun, keep_calibration};
 use crate::rig::{Pace, Rig};
 use crate::run::error::RunError;
-use crate::run::life::{Ended, Foreseen, Measurement, Run, end_entry, end_state};
+use crate::run::life::{Ended, Foreseen, Measurement, Run, end_state};
 use crate::run::orders::Orders;
 use crate::run::progress::ProgressMeter;
 
@@ -114,6 +114,8 @@ struct Acquired {
     latency: Option<SettingsLatency>,
     /// The fault that ended acquisition early, if any.
     fault: Option<RunError>,
+    /// Warnings from before the run began.
+    warnings: Vec<String>,
 }
 
 impl FilmRun {
@@ -167,6 +169,7 @@ impl FilmRun {
             exposures,
             latency,
             fault: points.write_error.map(RunError::from).or(no_light).or(fault),
+            warnings: points.run.warnings,
         })
     }
 
@@ -220,18 +223,10 @@ impl FilmRun {
 /// a short one; but its products are not made, so that it ends soon.
 fn conclude(acquired: Acquired, run: &FilmRun, orders: &Orders) -> Result<Ended, RunError> {
     let FilmRun { rig, film, products, stages, .. } = run;
-    let Acquired { session, mut ledger, mut problems, vsync, exposures, latency, fault } = acquired;
+    let Acquired { session, mut ledger, mut problems, vsync, exposures, latency, fault, mut warnings } =
+        acquired;
     let state = end_state(fault.as_ref(), orders);
-    let stored = ledger.state().stored_points();
-    let end = EndEntry {
-        error: fault.map(|fault| fault.to_string()),
-        vsync,
-        final_s: exposures.until.map(|until| until.elapsed().as_secs_f64()),
-        light_s: exposures.light_s(),
-        simulated_time: exposures.is_simulated,
-        settings_latency: latency,
-        ..end_entry(state, stored, ledger.state().missing_points())
-    };
+    let final_s = exposures.until.map(|until| until.elapsed().as_secs_f64());
     let go_on = || orders.go_on();
     let mut made = match state {
         EndState::Complete => {
@@ -245,12 +240,22 @@ fn conclude(acquired: Acquired, run: &FilmRun, orders: &Orders) -> Result<Ended,
             "the film was ended early, so its products are not made: `raysweep process` makes them".into(),
         );
     }
+    let transports_missing = ledger.state().film.as_ref().map_or(0, |film| film.transports_missing);
+    warnings.extend(problems.iter().cloned().chain(shortcomings(ledger.state(), transports_missing)));
+    let stored = ledger.state().stored_points();
+    let end = EndEntry {
+        error: fault.map(|fault| fault.to_string()),
+        vsync,
+        final_s,
+        light_s: exposures.light_s(),
+        simulated_time: exposures.is_simulated,
+        settings_latency: latency,
+        ..EndEntry::new(state, stored, ledger.state().missing_points(), warnings)
+    };
     ledger.append(&Entry::End(end.clone()))?;
     if state != EndState::Faulted {
         write_report(&session, ledger.state(), film, &made, &problems)?;
         manifest::write(&session, ledger.state(), &film.task, &rig.file)?;
     }
-    let missing = ledger.state().film.as_ref().map_or(0, |film| film.transports_missing);
-    problems.extend(shortcomings(ledger.state(), missing));
-    Ok(Ended { end, warnings: problems, found: Vec::new() })
+    Ok(Ended { end, found: Vec::new() })
 }

@@ -8,7 +8,7 @@ use raysweep_config::plan::PatternsPlan;
 use raysweep_config::{ConfigError, Plan};
 use raysweep_core::SettingsId;
 use raysweep_processing::calibration::KeptCalibration;
-use raysweep_processing::patterns::{Made, PatternsTask, make};
+use raysweep_processing::patterns::{PatternProducts, PatternsTask};
 use raysweep_processing::plane::Processing;
 use raysweep_proto::RpcError;
 use raysweep_session::Session;
@@ -19,7 +19,7 @@ use crate::plane::{Opened, Passes, PointSink, Taken, is_any_lit, missing, regula
 use crate::procedure::lab::{Lab, RigOfRun, keep_calibration};
 use crate::rig::Rig;
 use crate::run::error::RunError;
-use crate::run::life::{Ended, Foreseen, Measurement, Run, end_entry, end_state};
+use crate::run::life::{Ended, Foreseen, Measurement, Run, end_state};
 use crate::run::progress::ProgressMeter;
 
 /// Capacity of the queue of images between the assembler and the disk.
@@ -81,27 +81,28 @@ impl Measurement for PatternsRun {
         })?;
         let Taken { sink: PointSink { run, vsync, write_error, no_light, .. }, exposures, latency, fault } =
             taken;
-        let Run { session, mut ledger, orders, .. } = run;
+        let Run { session, mut ledger, orders, mut warnings, .. } = run;
         let no_light = no_light.map(RunError::no_regular_light);
         let fault = write_error.map(RunError::from).or(no_light).or(fault);
         let state = end_state(fault.as_ref(), &orders);
+        let products = (state == EndState::Complete)
+            .then(|| PatternProducts::make(&session, ledger.state(), &patterns))
+            .transpose()?;
+        warnings.extend(products.iter().flat_map(PatternProducts::warnings).cloned());
+        let stored = ledger.state().stored_points();
         let end = EndEntry {
             error: fault.map(|fault| fault.to_string()),
             vsync,
             light_s: exposures.light_s(),
             simulated_time: exposures.is_simulated,
             settings_latency: latency,
-            ..end_entry(state, ledger.state().stored_points(), ledger.state().missing_points())
+            ..EndEntry::new(state, stored, ledger.state().missing_points(), warnings)
         };
         ledger.append(&Entry::End(end.clone()))?;
-        let warnings = match state {
-            EndState::Complete => {
-                let Made { problems, warnings } = make(&session, ledger.state(), &patterns, &rig.file)?;
-                [problems, warnings].concat()
-            }
-            EndState::Cancelled | EndState::Faulted => Vec::new(),
-        };
-        Ok(Ended { end, warnings, found: Vec::new() })
+        if let Some(products) = products {
+            products.write_report(&session, ledger.state(), &patterns, &rig.file)?;
+        }
+        Ok(Ended { end, found: Vec::new() })
     }
 }
 

@@ -35,6 +35,8 @@ pub struct Recorded {
     pub ledger: Ledger,
     /// The fault that ended acquisition early, if any.
     pub fault: Option<RunError>,
+    /// Warnings from before the run began.
+    pub warnings: Vec<String>,
 }
 
 /// Records both axes.
@@ -74,8 +76,8 @@ pub fn acquire(rig: &DotRig, task: &Arc<ResponseTask>, mut run: Run) -> Result<R
     if let Err(error) = camera.disarm() {
         tracing::warn!(%error, "camera not disarmed");
     }
-    let Run { session, ledger, .. } = recorder.run;
-    Ok(Recorded { session, ledger, fault: passed.err() })
+    let Run { session, ledger, warnings, .. } = recorder.run;
+    Ok(Recorded { session, ledger, fault: passed.err(), warnings })
 }
 
 /// Makes and stores the records.

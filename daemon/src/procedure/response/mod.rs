@@ -14,7 +14,7 @@ use self::acquire::{Recorded, acquire};
 use crate::procedure::lab::Lab;
 use crate::rig::DotRig;
 use crate::run::error::RunError;
-use crate::run::life::{Ended, Foreseen, Measurement, Run, end_entry};
+use crate::run::life::{Ended, Foreseen, Measurement, Run};
 
 /// A mirror's chirps on a rig.
 struct ResponseRun {
@@ -49,7 +49,7 @@ impl Measurement for ResponseRun {
     fn measure(self: Box<Self>, run: Run) -> Result<Ended, RunError> {
         let Self { rig, task } = *self;
         let data = run.data.clone();
-        let Recorded { session, mut ledger, mut fault } = acquire(&rig, &task, run)?;
+        let Recorded { session, mut ledger, mut fault, mut warnings } = acquire(&rig, &task, run)?;
         let stored = ledger.state().stored_points();
         let is_whole = fault.is_none() && stored == AXES.len();
         let findings = is_whole.then(|| MirrorFindings::of(&session, ledger.state(), &task)).transpose()?;
@@ -57,6 +57,7 @@ impl Measurement for ResponseRun {
             fault = findings.refusal().cloned().map(RunError::from);
             // Must come before the ledger records the run as complete.
             findings.keep(&session, ledger.state(), Some(&data))?;
+            warnings.extend(findings.warnings());
         }
         let state = match (&fault, is_whole) {
             (Some(_), _) => EndState::Faulted,
@@ -64,13 +65,13 @@ impl Measurement for ResponseRun {
             (None, false) => EndState::Cancelled,
         };
         let error = fault.map(|fault| fault.to_string());
-        let end = EndEntry { error, ..end_entry(state, stored, ledger.state().missing_points()) };
+        let missing = ledger.state().missing_points();
+        let end = EndEntry { error, ..EndEntry::new(state, stored, missing, warnings) };
         ledger.append(&Entry::End(end.clone()))?;
         if let Some(findings) = &findings {
             findings.write(&session, ledger.state(), &task, &rig.file)?;
         }
-        let said = findings.map(|findings| (findings.warnings(), findings.resonances()));
-        let (warnings, found) = said.unwrap_or_default();
-        Ok(Ended { end, warnings, found })
+        let found = findings.map_or_else(Vec::new, |findings| findings.resonances());
+        Ok(Ended { end, found })
     }
 }

@@ -25,7 +25,7 @@ use crate::plane::{Opened, Passes, PointSink, Taken, is_any_lit, missing, regula
 use crate::procedure::lab::{Lab, RigOfRun, keep_calibration};
 use crate::rig::Rig;
 use crate::run::error::RunError;
-use crate::run::life::{Ended, Foreseen, Measurement, Run, end_entry, end_state};
+use crate::run::life::{Ended, Foreseen, Measurement, Run, end_state};
 use crate::run::orders::Orders;
 use crate::run::progress::ProgressMeter;
 
@@ -118,6 +118,8 @@ struct Acquired {
     latency: Option<SettingsLatency>,
     /// The fault that ended acquisition early, if any.
     fault: Option<RunError>,
+    /// Warnings from before the run began.
+    warnings: Vec<String>,
 }
 
 /// Acquires what is missing.
@@ -158,6 +160,7 @@ fn acquire(
         exposures,
         latency,
         fault: sink.write_error.map(RunError::from).or(no_light).or(fault),
+        warnings: sink.run.warnings,
     })
 }
 
@@ -203,7 +206,8 @@ fn conclude(
     live: Option<&Outlet>,
 ) -> Result<Ended, RunError> {
     let task = &*sweep.task;
-    let Acquired { session, mut ledger, processing, vsync, exposures, latency, fault } = acquired;
+    let Acquired { session, mut ledger, processing, vsync, exposures, latency, fault, mut warnings } =
+        acquired;
     let whole = fault.is_none() && missing(task, ledger.state()).is_empty();
     let began = Instant::now();
     let make = || match in_strips {
@@ -216,6 +220,7 @@ fn conclude(
         (EndState::Complete, None) => EndState::Faulted,
         (state, _) => state,
     };
+    warnings.extend(results.iter().flat_map(Results::warnings).cloned());
     let stored = ledger.state().stored_points();
     let mut end = EndEntry {
         error: fault.map(|fault| fault.to_string()),
@@ -223,7 +228,7 @@ fn conclude(
         light_s: exposures.light_s(),
         simulated_time: exposures.is_simulated,
         settings_latency: latency,
-        ..end_entry(state, stored, ledger.state().missing_points())
+        ..EndEntry::new(state, stored, ledger.state().missing_points(), warnings)
     };
     if let (EndState::Complete, Some(results)) = (state, &mut results) {
         results.write_transport()?;
@@ -241,7 +246,7 @@ fn conclude(
     } else {
         ledger.append(&Entry::End(end.clone()))?;
     }
-    Ok(Ended { end, warnings: results.map_or_else(Vec::new, Results::into_warnings), found: Vec::new() })
+    Ok(Ended { end, found: Vec::new() })
 }
 
 /// Publishes the result where the earlier estimates were published.

@@ -18,7 +18,7 @@ use raysweep_session::stack::{Contents, StackShape};
 use crate::procedure::lab::{Lab, RigOfRun};
 use crate::rig::{DotRig, Rig};
 use crate::run::error::RunError;
-use crate::run::life::{Ended, Foreseen, Measurement, Run, end_entry};
+use crate::run::life::{Ended, Foreseen, Measurement, Run};
 
 /// A viewfinder on a rig.
 enum FinderRun {
@@ -89,8 +89,8 @@ impl Measurement for FinderRun {
         // It has no end of its own: whoever cancels it has seen enough.
         let state = if error.is_some() { EndState::Faulted } else { EndState::Complete };
         let light_s = Some(began.elapsed().as_secs_f64());
-        let end = EndEntry { error, light_s, ..end_entry(state, 0, 0) };
+        let end = EndEntry { error, light_s, ..EndEntry::new(state, 0, 0, run.warnings) };
         run.ledger.append(&Entry::End(end.clone()))?;
-        Ok(Ended { end, warnings: Vec::new(), found: Vec::new() })
+        Ok(Ended { end, found: Vec::new() })
     }
 }

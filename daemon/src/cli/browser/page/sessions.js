@@ -7,9 +7,11 @@ import { line, plotIn } from "./plots.js";
 const nameOf = (folder) => folder.split("/").pop();
 const address = (session, rest = "") => `session/${encodeURIComponent(session)}${rest}`;
 
-/** What the list shows of a session. */
-const shownOf = ({ name, created, kind, state, sample, operator }) =>
-  [name, `${created.slice(0, 16).replace("T", " ")} UTC`, kind, state, sample, operator].filter(Boolean);
+const warned = ({ length }) => length && `${length} warning${length === 1 ? "" : "s"}`;
+
+/** What the list shows of a session. Earlier daemons tell no warnings. */
+const shownOf = ({ name, created, kind, state, warnings = [], sample, operator }) => [name,
+  `${created.slice(0, 16).replace("T", " ")} UTC`, kind, state, warned(warnings), sample, operator].filter(Boolean);
 
 let [listed, chosen, other] = [[], null, null];
 /** Thumbnails by session, with the state of the session that they show. */
@@ -94,7 +96,8 @@ export function startSessions({ watch }) {
           images.length ? menu : null, one.report ? link(first, two ? "report of the first" : "report") : null,
           two?.report ? link(second, "report of the second") : null,
           !two && one.can_resume ? resume(first, place) : null),
-        ...[one, two].filter(Boolean).flatMap(({ damage }) => damage.map((what) => note("warn", what))),
+        ...[one, two].filter(Boolean).flatMap(({ session, damage, warnings }) => [...damage, ...warnings]
+          .map((what) => note("warn", two ? `${nameOf(session)}: ${what}` : what))),
         ...(two ? [] : [figures(one)]), sides, plot);
       const pixel = profile(plot, [one, two].filter(Boolean));
       const draw = () => pictures(sides, [first, second], menu, pixel);
