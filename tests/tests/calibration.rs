@@ -446,6 +446,8 @@ fn a_plan_without_settings_gets_those_that_suit_the_calibration() {
         assert_eq!(uncalibrated.settings, None);
         assert_eq!(bench.run(&quick()).state, "complete");
         let report = bench.runner.check(plan).unwrap();
+        let advice = report.advice.unwrap();
+        assert!(report.settings.is_none() || advice.better.is_none(), "what was just chosen");
         let ended = bench.run(plan);
         assert_eq!(ended.state, "complete", "{:?}", ended.error);
         let stated = fs::read_to_string(ended.session.join("plan.toml")).unwrap();

@@ -14,8 +14,8 @@ pub struct PlanAdvice {
     pub prior: String,
     /// Expected error of the plan's settings.
     pub expected: ExpectedError,
-    /// Settings with no more frames and no longer duration, whose expected error is at least 10 % smaller; `None` if
-    /// none were found.
+    /// Settings with no more frames and no longer duration, whose expected error is at least 10 % smaller, or 25 % if they
+    /// would replace settings that were chosen for the calibration in use; `None` if none were found.
     pub better: Option<BetterPlan>,
 }
 

@@ -234,7 +234,7 @@ fn advice(advice: &PlanAdvice) -> Vec<(&'static str, String)> {
     let (dark, shot) = (short(noise.dark), short(noise.shot));
     let planned = expected;
     let better = better.as_ref().map_or_else(
-        || "no better settings of this length found".into(),
+        || "no clearly better settings of this length found".into(),
         |BetterPlan { points, frames, expected, .. }| {
             let (found, for_which) = (range(&expected.total), better_for(&planned.total, &expected.total));
             format!("{for_which}{found}, with {points} settings and {frames} frames; see below")

@@ -118,12 +118,23 @@ fn known<T: Searched>(of: &T) -> Calibrated {
     }
 }
 
-/// Predicts the error of `planned`, and searches for better settings that take no more frames and no more time.
+/// To what share settings must lower the errors of typical and of hard scenes alike to be proposed in place of those that
+/// were chosen for the calibration, which nobody asked to replace.
+const CLEARLY: f64 = 0.75;
+
+fn is_clearly_better(proposed: &PredictedError, chosen: &PredictedError) -> bool {
+    let errors = [(proposed.total.median, chosen.total.median), (proposed.total.high, chosen.total.high)];
+    errors.into_iter().all(|(proposed, chosen)| proposed <= CLEARLY * chosen)
+}
+
+/// Predicts the error of `planned`, and searches for better settings that take no more frames and no more time: clearly
+/// better ones if those of the plan were chosen for the calibration.
 ///
 /// # Errors
 /// If no error can be predicted.
 pub fn advise<T: Searched>(
     planned: &T,
+    is_chosen: bool,
     rig: &RigFile,
     camera: &CameraCapabilities,
 ) -> Result<PlanAdvice, NoAdvice> {
@@ -133,7 +144,9 @@ pub fn advise<T: Searched>(
         total_frames(other) <= most_frames && adviser.total_periods(other) <= most_periods
     });
     let advice = search.advise()?;
-    let better = advice.better.and_then(|Proposal { design, foreseen }| {
+    let better =
+        advice.better.filter(|better| !is_chosen || is_clearly_better(&better.foreseen, &advice.expected));
+    let better = better.and_then(|Proposal { design, foreseen }| {
         let other = planned.with_design(&design)?;
         Some(BetterPlan {
             points: design.settings().len(),
@@ -368,5 +381,23 @@ fn told(foreseen: &PredictedError) -> ExpectedError {
         bias: range(foreseen.bias),
         calibration: range(foreseen.calibration),
         band: range(foreseen.band),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn clearly_better_settings_suit_typical_and_hard_scenes_alike() {
+        let errors = |median, high| {
+            let total = Spread { low: 0.01, median, high };
+            PredictedError { total, noise: total, bias: total, calibration: total, band: total }
+        };
+        let chosen = errors(0.04, 0.4);
+        assert!(is_clearly_better(&errors(0.029, 0.29), &chosen));
+        for other in [errors(0.031, 0.29), errors(0.029, 0.31), errors(0.01, 0.4), errors(0.04, 0.1)] {
+            assert!(!is_clearly_better(&other, &chosen), "{other:?}");
+        }
     }
 }

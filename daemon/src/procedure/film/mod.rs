@@ -81,7 +81,7 @@ pub fn foresee(
 
 impl Measurement for FilmRun {
     fn advise(&self, report: &mut CheckReport) {
-        match advise(&self.film, &self.rig.file, &self.camera) {
+        match advise(&self.film, report.settings.is_some(), &self.rig.file, &self.camera) {
             Ok(advice) => report.advice = Some(advice),
             Err(none) => report.warnings.push(none.to_string()),
         }

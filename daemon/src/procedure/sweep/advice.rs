@@ -90,14 +90,14 @@ mod tests {
 
     fn advised(rig: &str, plan: &str, camera: &CameraCapabilities) -> Result<PlanAdvice, NoAdvice> {
         let rig = RigFile::parse(rig).unwrap();
-        advise(&task(&rig, plan), &rig, camera)
+        advise(&task(&rig, plan), false, &rig, camera)
     }
 
     #[test]
     fn the_proposed_sweep_is_what_it_is_said_to_be() {
         let (rig, camera) = (RigFile::parse(RIG).unwrap(), camera());
         let own = task(&rig, SMALL);
-        let advice = advise(&own, &rig, &camera).unwrap();
+        let advice = advise(&own, false, &rig, &camera).unwrap();
         let better = advice.better.unwrap();
         let other = task(&rig, &format!("kind = \"sweep\"\n{}", better.table));
         assert_eq!((other.points(), other.sweep.average), (better.points, 1));
@@ -109,7 +109,7 @@ mod tests {
         // By hand: 2500 counts of 1.66 electrons, 9 electrons of read noise, rounded to counts.
         let read = ((9.0_f64 / 4150.0).powi(2) + 1.0 / 12.0 / 2500.0_f64.powi(2)).sqrt();
         assert!((advice.noise.dark - read).abs() < 1e-12);
-        assert_eq!(advise(&other, &rig, &camera).unwrap().expected, better.expected);
+        assert_eq!(advise(&other, false, &rig, &camera).unwrap().expected, better.expected);
     }
 
     #[test]
@@ -138,7 +138,7 @@ mod tests {
         };
         let task = Arc::make_mut(&mut own.task);
         task.geometry = stated.calibrated(Arc::new(calibration));
-        let noise = advise(&own, &rig, &camera).unwrap().noise;
+        let noise = advise(&own, false, &rig, &camera).unwrap().noise;
         assert_eq!((noise.dark, noise.shot, noise.source), (0.2, 0.3, NoiseSource::Calibrated));
     }
 

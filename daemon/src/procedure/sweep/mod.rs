@@ -84,7 +84,7 @@ pub fn foresee(
 
 impl Measurement for SweepRun {
     fn advise(&self, report: &mut CheckReport) {
-        match advise(&self.sweep, &self.rig.file, &self.camera) {
+        match advise(&self.sweep, report.settings.is_some(), &self.rig.file, &self.camera) {
             Ok(advice) => report.advice = Some(advice),
             Err(none) => report.warnings.push(none.to_string()),
         }
