@@ -6,6 +6,7 @@
 mod process;
 
 use std::fs;
+use std::os::unix::fs::symlink;
 use std::path::PathBuf;
 use std::process::{Command, Stdio};
 use std::sync::Arc;
@@ -27,6 +28,7 @@ use raysweep_sim::mirror::{
     Held, MirrorPty, PlayzerXController, PlayzerXControllerConfig, SerialLink, WireFaults,
 };
 use raysweep_transport::dots::{Background, DotsError, NoiseFloor, SparseColumn};
+use serde_json::Value;
 use tempfile::TempDir;
 
 /// 6500 samples and 50 dots per batch: few enough frames for any machine.
@@ -422,4 +424,46 @@ fn parking_what_was_never_moved_is_a_failure_unless_only_what_was_moved_is_to_be
     let (code, said) = park(&[]);
     assert!(code == Some(1) && said.contains("mirror.json does not exist: nothing was parked"), "{said}");
     assert_eq!(park(&["--if-moved"]), (Some(0), String::new()));
+}
+
+/// Nothing is known of a mirror whose state cannot be read: it must not pass for a parked one.
+#[test]
+fn a_state_that_cannot_be_read_is_no_parked_mirror() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    fs::create_dir(path("folder")).unwrap();
+    symlink("loop", path("loop")).unwrap();
+    let (sound, torn) = (r#"{"playing": null}"#, r#"{"boot_id": "#);
+    let files: [(&str, &[u8]); 4] =
+        [("empty", b""), ("other", sound.as_bytes()), ("torn", torn.as_bytes()), ("bytes", &[0, 0xff, 0])];
+    for (name, content) in files {
+        fs::write(path(name), content).unwrap();
+    }
+    let park = |state: &str, more: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_raysweep"));
+        let output =
+            command.current_dir(&folder).args(["park", "--state", state]).args(more).output().unwrap();
+        let text = |bytes| String::from_utf8(bytes).unwrap();
+        (output.status.code(), text(output.stdout), text(output.stderr))
+    };
+    for state in ["folder", "loop", "empty", "other", "torn", "bytes", "empty/mirror.json"] {
+        for more in [&[] as &[&str], &["--if-moved"], &["--when-closed"]] {
+            let (code, out, err) = park(state, more);
+            assert_eq!((code, out.as_str()), (Some(1), ""), "{state} {more:?}: {err}");
+            assert!(err.contains(state) && !err.contains("parked"), "{state} {more:?}: {err}");
+        }
+        let (code, out, _) = park(state, &["--json"]);
+        let said: Value = serde_json::from_str(&out).unwrap();
+        assert!(
+            code == Some(1) && said["error"].is_object() && said.get("parked").is_none(),
+            "{state}: {said}"
+        );
+    }
+    let (code, out, _) = park("/nonexistent/mirror.json", &[]);
+    assert!(
+        code == Some(1) && out.contains("/nonexistent/mirror.json does not exist: nothing was parked"),
+        "{out}"
+    );
+    let (code, out, _) = park("/nonexistent/mirror.json", &["--json"]);
+    assert_eq!((code, out.trim()), (Some(1), r#"{"parked":"nothing"}"#));
 }

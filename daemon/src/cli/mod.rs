@@ -160,7 +160,7 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             connect()?.arm_light()?;
             printer.print(&Empty {}, |_| "light is permitted until the next boot".into())?;
         }
-        Command::Park { state, if_moved: true, .. } if !state.exists() => {}
+        Command::Park { state, if_moved: true, .. } if matches!(state.try_exists(), Ok(false)) => {}
         Command::Park { state, when_closed, .. } => {
             let is_there = state.exists();
             let parked = if when_closed {
