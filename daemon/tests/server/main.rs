@@ -9,3 +9,4 @@ mod malformed;
 mod process;
 mod sessions;
 mod socket;
+mod terminal;
