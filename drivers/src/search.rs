@@ -114,7 +114,11 @@ pub fn analysers() -> Vec<FoundAnalyser> {
 
 /// Pulse-per-second sources of the kernel.
 pub fn pulse_sources() -> Vec<FoundPulses> {
-    let found = entries(Path::new("/sys/class/pps")).into_iter().filter_map(|source| {
+    pulse_sources_in(Path::new("/sys/class/pps"))
+}
+
+fn pulse_sources_in(class: &Path) -> Vec<FoundPulses> {
+    let found = entries(class).into_iter().filter_map(|source| {
         let about = fs::read_to_string(source.join("name")).unwrap_or_default().trim().to_owned();
         Some(FoundPulses { path: Path::new("/dev").join(source.file_name()?), about })
     });
@@ -123,7 +127,11 @@ pub fn pulse_sources() -> Vec<FoundPulses> {
 
 /// Display outputs with a display.
 pub fn displays() -> Vec<FoundDisplay> {
-    let found = entries(Path::new("/sys/class/drm")).into_iter().filter_map(|output| {
+    displays_in(Path::new("/sys/class/drm"))
+}
+
+fn displays_in(class: &Path) -> Vec<FoundDisplay> {
+    let found = entries(class).into_iter().filter_map(|output| {
         let name = output.file_name()?.to_str()?.to_owned();
         let (card, connector) = name.split_once('-')?;
         let status = fs::read_to_string(output.join("status")).ok()?;
@@ -153,7 +161,77 @@ fn entries(folder: &Path) -> Vec<PathBuf> {
 
 #[cfg(test)]
 mod tests {
+    use raysweep_sim::mirror::{
+        MechanicsConfig, MirrorPty, MtiController, PlayzerXController, PlayzerXControllerConfig, Pty,
+        SerialLink, WireFaults,
+    };
+    use raysweep_sim::triggerbox::TriggerBoxPty;
+
     use super::*;
+
+    /// A class of the kernel's devices, as files with these contents.
+    fn class(files: &[(&str, &str)]) -> tempfile::TempDir {
+        let folder = tempfile::tempdir().unwrap();
+        for (file, content) in files {
+            let path = folder.path().join(file);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, content).unwrap();
+        }
+        folder
+    }
+
+    #[test]
+    fn displays_are_the_outputs_to_which_one_is_connected_with_the_preferred_mode_first() {
+        let class = class(&[
+            ("version", "drm 1.1.0 20060810\n"),
+            ("card0/dev", "226:0\n"),
+            ("renderD128/dev", "226:128\n"),
+            ("card0-DP-1/status", "disconnected\n"),
+            ("card0-DP-1/modes", ""),
+            ("card1-HDMI-A-2/status", "connected\n"),
+            ("card1-HDMI-A-2/modes", "1920x1080\n1280x720\n"),
+            ("card0-eDP-1/status", "connected\n"),
+            ("card0-VGA-1/status", "unknown\n"),
+        ]);
+        let found = displays_in(class.path());
+        let display = |card: &str, connector: &str, modes: &[&str]| FoundDisplay {
+            card: card.into(),
+            connector: connector.into(),
+            modes: modes.iter().map(|&mode| mode.into()).collect(),
+        };
+        let hdmi = display("/dev/dri/card1", "HDMI-A-2", &["1920x1080", "1280x720"]);
+        assert_eq!(found, [display("/dev/dri/card0", "eDP-1", &[]), hdmi]);
+        assert_eq!(displays_in(&class.path().join("none")), []);
+    }
+
+    #[test]
+    fn pulse_sources_are_told_with_their_nodes_and_names() {
+        let class = class(&[("pps1/name", "ktimer\n"), ("pps0/name", "serial0\n"), ("pps2/dev", "250:2\n")]);
+        let pulses =
+            |node: &str, about: &str| FoundPulses { path: Path::new("/dev").join(node), about: about.into() };
+        let expected = [pulses("pps0", "serial0"), pulses("pps1", "ktimer"), pulses("pps2", "")];
+        assert_eq!(pulse_sources_in(class.path()), expected);
+        assert_eq!(pulse_sources_in(&class.path().join("none")), []);
+    }
+
+    #[test]
+    fn devices_at_serial_ports_are_told_from_each_other() {
+        let (usb, sound) = (SerialLink::VirtualCom, WireFaults::default());
+        let playzerx = PlayzerXController::new(PlayzerXControllerConfig::default());
+        let playzerx = MirrorPty::plug(playzerx, usb, sound).unwrap();
+        let mti = MirrorPty::plug(MtiController::new(MechanicsConfig::default()), usb, sound).unwrap();
+        let trigger = TriggerBoxPty::plug(16_666_667, usb, sound).unwrap();
+        let mute = Pty::plug(Box::new(|_: &[u8], _: i64, _: &mut Vec<u8>| ()), usb, sound).unwrap();
+        assert!(matches!(ask(playzerx.path()), Some(Answering::PlayzerX(about)) if !about.is_empty()));
+        assert!(matches!(ask(mti.path()), Some(Answering::Mti(about)) if !about.is_empty()));
+        assert!(matches!(ask(trigger.path()), Some(Answering::TriggerBox(14))));
+        assert_eq!(ask(mute.path()), None);
+        assert_eq!(ask(Path::new("/nonexistent")), None);
+        for mirror in [&playzerx, &mti] {
+            let held = mirror.truth().held;
+            assert!(held.iter().all(|held| (held.x, held.y, held.light) == (0.0, 0.0, 0)), "moved or lit");
+        }
+    }
 
     #[test]
     fn a_node_is_called_by_the_link_that_stays_with_its_device_if_it_has_one() {
