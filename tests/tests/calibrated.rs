@@ -14,8 +14,8 @@ use rand_xoshiro::rand_core::SeedableRng;
 use raysweep::rig::Rig;
 use raysweep_core::{Counts, SettingsId};
 use raysweep_pipeline::{
-    DemuxFold, DemuxOptions, FilmSolver, Point, PointRole, Schedule, Solved, Spot, SpotScan, SweepGeometry,
-    Unit,
+    DemuxFold, DemuxOptions, FilmImage, FilmSolver, Point, PointRole, Schedule, Solved, Spot, SpotScan,
+    SweepGeometry, Unit,
 };
 use raysweep_sim::PlaneRig;
 use raysweep_tests::{data, rig_text};
@@ -64,6 +64,7 @@ impl Studio {
             height,
             width,
             white_dn: rig.file.camera.white_dn(),
+            black_dn: BLACK_DN,
             saturation_dn: 0.97 * 4095.0,
             calibration: None,
         };
@@ -100,7 +101,8 @@ impl Studio {
             response: PixelResponse::with_beam(places, &beam).unwrap(),
             drawing: None,
             white_dn: Array2::from_shape_fn(size, |(t, s)| self.white_dn(t, s) as f32),
-            curve: None,
+            dark_offset_dn: self.dark(),
+            linearity_per_dn: None,
             saturation_dn: None,
             noise: NoiseModel { read_variance: 6e-5, gain: 2.4e-4 },
             strip: None,
@@ -187,13 +189,13 @@ impl Studio {
         let schedule = film_schedule();
         let mut solver = FilmSolver::new(DemuxOptions::default(), &schedule, geometry).unwrap();
         let mut noise = Xoshiro256PlusPlus::seed_from_u64(2);
-        let dark = self.dark();
+        let dark = image(0.0, self.dark());
         let cycle = |_| {
-            let frames: Vec<(Setting, Arc<Array2<f32>>)> = schedule.points[1..]
+            let frames: Vec<FilmImage> = schedule.points[1..]
                 .iter()
                 .map(|point| {
-                    let (delay_us, image) = self.take(geometry, point, 1, &mut noise);
-                    (Setting::new(delay_us, point.exposure_us), Arc::new(image))
+                    let (delay_us, counts) = self.take(geometry, point, 1, &mut noise);
+                    image(delay_us, counts)
                 })
                 .collect();
             let began = Instant::now();
@@ -205,6 +207,11 @@ impl Studio {
         };
         (0..6).map(cycle).collect()
     }
+}
+
+/// An image of a film in a dark room.
+fn image(delay_us: f64, counts: Array2<f32>) -> FilmImage {
+    FilmImage { setting: Setting::new(delay_us, 600.0), starts_ns: Vec::new(), counts: Arc::new(counts) }
 }
 
 fn sweep_schedule() -> Schedule {
@@ -336,11 +343,11 @@ fn a_frame_that_comes_to_lie_on_the_direct_row_is_left_out_of_its_cycle() {
     let schedule = film_schedule();
     let mut solver = FilmSolver::new(DemuxOptions::default(), &schedule, &geometry).unwrap();
     let mut noise = Xoshiro256PlusPlus::seed_from_u64(3);
-    let dark = studio.dark();
-    let mut cycle = || -> Vec<(Setting, Arc<Array2<f32>>)> {
+    let dark = image(0.0, studio.dark());
+    let mut cycle = || -> Vec<FilmImage> {
         let take = |point: &Point| {
-            let (delay_us, image) = studio.take(&geometry, point, 1, &mut noise);
-            (Setting::new(delay_us, point.exposure_us), Arc::new(image))
+            let (delay_us, counts) = studio.take(&geometry, point, 1, &mut noise);
+            image(delay_us, counts)
         };
         schedule.points[1..].iter().map(take).collect()
     };
@@ -349,8 +356,7 @@ fn a_frame_that_comes_to_lie_on_the_direct_row_is_left_out_of_its_cycle() {
     let frames = cycle();
     let solve = |delay_us: f64, factor: f32| {
         let mut frames = frames.clone();
-        let (setting, image) = &mut frames[11];
-        (setting.delays_us, *image) = (vec![delay_us], Arc::new(image.mapv(|counts| factor * counts)));
+        frames[11] = image(delay_us, frames[11].counts.mapv(|counts| factor * counts));
         solver.solve(&frames, &dark, &|| true).unwrap().t
     };
     // An exposure of 600 us begins on the direct row at a delay of 300 us, and 420 us is far from it.

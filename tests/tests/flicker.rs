@@ -1,4 +1,5 @@
-//! A lamp that flickers over a sweep: the times of the frames remove it, in a run and when it is processed again.
+//! A lamp that flickers over a sweep or a film: the times of the frames remove it, in a run and when it is processed
+//! again.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -9,7 +10,8 @@ use ndarray::{Array3, Axis, s};
 use raysweep::control::Control;
 use raysweep::rig::Rig;
 use raysweep_processing::calibration::KeptCalibration;
-use raysweep_session::ledger::FrameStarts;
+use raysweep_session::film::TransportFilm;
+use raysweep_session::ledger::{FrameStarts, State};
 use raysweep_session::stack::ArrayName;
 use raysweep_tests::{Bench, Ended, corner_rig, rig_text};
 use raysweep_transport::plane::relative_rows;
@@ -40,12 +42,18 @@ fn swept(ambient: &str) -> (Bench, Ended, f64) {
 
 /// The median relative error of a session's T.
 fn error_of(bench: &Bench, ended: &Ended) -> f64 {
-    let rig = Rig::load(&bench.folder.path().join("rig.toml")).unwrap();
     let found: Array3<f32> = ndarray_npy::read_npy(ended.session.join("products/transport.npy")).unwrap();
-    let u_min = metadata(&ended.session)["u_min"].as_i64().unwrap();
-    let found = found.slice(s![(-94 - u_min) as usize..=(94 - u_min) as usize, .., ..]);
+    error_of_transport(bench, &found, metadata(&ended.session)["u_min"].as_i64().unwrap())
+}
+
+fn error_of_transport(bench: &Bench, found: &Array3<f32>, u_min: i64) -> f64 {
+    let rig = Rig::load(&bench.folder.path().join("rig.toml")).unwrap();
+    // A film reaches fewer rows than a sweep.
+    let most = (u_min + found.len_of(Axis(0)) as i64 - 1).min(94);
+    let least = u_min.max(-94);
+    let found = found.slice(s![(least - u_min) as usize..=(most - u_min) as usize, .., ..]);
     let scene = rig.simulated().unwrap().scene().transport.index_axis(Axis(3), 0).to_owned();
-    median_profile_error(found, relative_rows(scene.view(), &(-94..=94)).view())
+    median_profile_error(found, relative_rows(scene.view(), &(least as i32..=most as i32)).view())
 }
 
 #[test]
@@ -89,6 +97,92 @@ fn a_lamp_that_flickers_does_no_more_harm_than_a_steady_one() {
     assert!(interrupted < 1.15 * steady, "{steady} steady, {interrupted} flickering and interrupted");
     raysweep_processing::process(session.dir()).unwrap();
     assert!(fs::read(ended.session.join("products/transport.npy")).unwrap() == again);
+}
+
+/// A film, and its ledger.
+fn filmed(rig: &str, cycles: u32) -> (Bench, Ended, State) {
+    let bench = Bench::new(rig);
+    let ended = bench.run(&format!("kind = \"film\"\n[film]\ncycles = {cycles}\n"));
+    assert_eq!(ended.state, "complete", "{:?}", ended.error);
+    let (_, state) = ended.open();
+    (bench, ended, state)
+}
+
+/// What the film says of the room's light, and its warnings of it.
+fn said_of_room(state: &State) -> (Option<String>, String) {
+    let film = state.film.clone().unwrap();
+    let said = film.findings.into_iter().find(|(subject, _)| subject == "room light");
+    let warnings = film.warnings.into_iter().filter(|warning| warning.contains("room's light"));
+    (said.map(|(_, said)| said), warnings.collect::<Vec<_>>().join("\n"))
+}
+
+/// Cycles of the films, of which the first four are not corrected.
+const CYCLES: u32 = 7;
+
+/// The transports of a film's cycles, and the first relative row.
+fn transports(ended: &Ended) -> (Vec<Array3<f32>>, i64) {
+    let (session, state) = ended.open();
+    let film = TransportFilm::open(&session.transport_film_path()).unwrap();
+    let u_min = film.attributes()["u_min"].as_i64().unwrap();
+    (state.cycles().map(|entry| film.read(entry.cycle).unwrap().unwrap().t).collect(), u_min)
+}
+
+/// The mean errors of T of the first four cycles of the corner's film, and of those after them.
+fn film_errors(bench: &Bench, ended: &Ended) -> [f64; 2] {
+    let (found, u_min) = transports(ended);
+    let errors: Vec<f64> = found.iter().map(|found| error_of_transport(bench, found, u_min)).collect();
+    println!("errors of T by cycle: {errors:.4?}");
+    [&errors[..4], &errors[4..]].map(|errors| errors.iter().sum::<f64>() / errors.len() as f64)
+}
+
+#[test]
+fn films_lose_a_lamp_that_flickers_after_their_first_cycles() {
+    let corner = |ambient: &str| corner_rig(ambient).replace("rows = 128", "rows = 720");
+    let (bench, ended, state) = filmed(&corner(STEADY), CYCLES);
+    let steady = film_errors(&bench, &ended);
+    assert_eq!(said_of_room(&state), (None, String::new()));
+    // Each cycle of 15 frames at 60 frames/s sees 100 Hz in the same phase.
+    for frequency_hz in [100, 99] {
+        let ambient = FLICKERING.replace("100", &frequency_hz.to_string());
+        let (bench, ended, state) = filmed(&corner(&ambient), CYCLES);
+        let [first, later] = film_errors(&bench, &ended);
+        let (said, warnings) = said_of_room(&state);
+        println!("{frequency_hz} Hz: {said:?}");
+        assert!(later < 1.2 * steady[1], "{later} flickering, {steady:?} steady");
+        assert!(first > 3.0 * steady[0], "{first} flickering, {steady:?} steady: is there a lamp?");
+        let said = said.unwrap();
+        assert!(said.contains(&format!("flickering at {frequency_hz}.0")), "{said}");
+        assert!(warnings.is_empty(), "{warnings}");
+
+        // Each cycle has the time of each of its frames, and processing computes the same from them.
+        let dark = state.point(ArrayName::Dark, 0).unwrap().exposed.clone().unwrap();
+        for cycle in state.cycles() {
+            let starts_ns = &cycle.starts_ns;
+            assert_eq!(starts_ns.len(), 15);
+            assert!(starts_ns.iter().all(|start_ns| start_ns > dark.starts_ns.last().unwrap()), "{cycle:?}");
+        }
+        let run = transports(&ended);
+        raysweep_processing::process(&ended.session).unwrap();
+        assert!(transports(&ended) == run);
+    }
+}
+
+#[test]
+fn neither_a_moving_scene_nor_jitter_is_taken_for_a_lamp() {
+    let sim = "scene = \"pendulum\"\nscene_rows = 48\nscene_columns = 32\nmotion_period_s = 1.3";
+    let (_bench, _ended, state) =
+        filmed(&rig_text(720, sim, &format!("[sim.projector]\nphase_jitter_us = 8\n{STEADY}")), 5);
+    assert_eq!(said_of_room(&state), (None, String::new()));
+}
+
+#[test]
+fn a_film_warns_of_a_lamp_in_step_with_its_frames() {
+    let (_bench, _ended, state) =
+        filmed(&corner_rig(&FLICKERING.replace("100", "120")).replace("rows = 128", "rows = 720"), 5);
+    let (said, warnings) = said_of_room(&state);
+    println!("{warnings}");
+    assert_eq!(said, None);
+    assert!(warnings.contains("120.0 Hz") && warnings.contains("switch the lamp off"), "{warnings}");
 }
 
 /// Pictures of three frames, which cancel 100 Hz.

@@ -1,13 +1,18 @@
 //! Films: a short sweep with one frame per setting, repeated without pause. Each cycle has its own light transport.
 
+mod lamp;
+
 use std::sync::Arc;
 
 use ndarray::{Array2, Array3, Axis};
 use raysweep_core::{CameraCapabilities, CameraSettings, Counts};
+use raysweep_transport::plane::calibrate::{FrameExposures, Unexplained};
 use raysweep_transport::plane::{Demux, PlaneError, Setting, Transport};
 
+use self::lamp::{FilmLamp, FilmRoom};
 use crate::demux::{DEMUX, DemuxFold, DemuxOptions};
 use crate::findings::{Choices, Findings, choose, rows_to_choose_by};
+use crate::flicker::RoomFindings;
 use crate::jitter::StripGauge;
 use crate::scale::LightScale;
 use crate::schedule::{PointRole, Schedule, SweepGeometry};
@@ -83,6 +88,31 @@ impl FilmFrame {
         let exposure_start_ns = *unit.starts_ns.last()?;
         Some(Self { setting, exposure_start_ns, raw: unit.sum.clone(), image })
     }
+
+    /// Its image after all stages, if it has one.
+    pub fn staged(&self) -> Option<FilmImage> {
+        let (setting, counts) = (self.setting.clone(), self.image.clone()?);
+        Some(FilmImage { setting, starts_ns: vec![self.exposure_start_ns], counts })
+    }
+}
+
+/// An image of a film after all stages: a frame, or the dark image.
+#[derive(Debug, Clone)]
+pub struct FilmImage {
+    /// The measured delays of its frames and the actual exposure.
+    pub setting: Setting,
+    /// Start of the exposure of row 0 in each of its frames, on the film's clock; empty if it was not stored.
+    pub starts_ns: Vec<i64>,
+    /// Mean counts, `[t, s]`.
+    pub counts: Arc<Array2<f32>>,
+}
+
+impl FilmImage {
+    /// A unit's image.
+    pub fn of(unit: &Unit, counts: Array2<f32>) -> Self {
+        let setting = Setting { delays_us: unit.delays_us.clone(), exposure_us: unit.exposure_us };
+        Self { setting, starts_ns: unit.starts_ns.clone(), counts: Arc::new(counts) }
+    }
 }
 
 /// A cycle during acquisition.
@@ -130,18 +160,29 @@ pub struct FilmSolver {
     /// The film's first cycles; `None` after it has learned from them.
     first: Option<FirstCycles>,
     /// What the plan says, by which those are solved.
-    planned: Choices,
+    planned: Known,
     /// What they showed.
-    learned: Option<Choices>,
+    learned: Option<Known>,
     /// The strip of the board that shows each frame's jitter, if it is in view.
     strip: Option<StripGauge>,
 }
 
-/// The sum of a film's first cycles.
+/// What is known before a cycle is solved.
+struct Known {
+    choices: Choices,
+    /// A lamp that flickers.
+    lamp: Option<FilmLamp>,
+}
+
+/// A film's first cycles.
 #[derive(Default)]
 struct FirstCycles {
     cycles: usize,
     sum: Option<SweepStack>,
+    /// Their frames of each setting.
+    frames: Vec<FrameExposures>,
+    /// What may show a lamp; of fewer cycles if the room is dark, or if it is not known when frames were exposed.
+    unexplained: Vec<Unexplained>,
 }
 
 impl FilmSolver {
@@ -165,7 +206,7 @@ impl FilmSolver {
         let dark = schedule.points.iter().find(|point| matches!(point.role, PointRole::Dark(_)));
         Ok(Self {
             options,
-            planned: Choices::planned(demux.clone(), geometry),
+            planned: Known { choices: Choices::planned(demux.clone(), geometry), lamp: None },
             learned: None,
             demux,
             geometry: geometry.clone(),
@@ -184,8 +225,7 @@ impl FilmSolver {
     }
 
     /// The transport from one frame of each setting, in the settings' order, with the delays and the exposure that the
-    /// camera states. `dark` is the image `[t, s]` without light. Stops early, with an error, soon after `go_on`
-    /// returns false.
+    /// camera states. `dark` is the image without light. Stops early, with an error, soon after `go_on` returns false.
     ///
     /// It does not start from the previous cycle's transport: the noise of single frames determines which rows are 0,
     /// so this would save no steps (5.2 per pixel with and without), and the bits would depend on what was solved
@@ -195,13 +235,13 @@ impl FilmSolver {
     /// If a frame's delay does not give a valid model, or `go_on` returned false.
     pub fn solve(
         &self,
-        frames: &[(Setting, Arc<Array2<f32>>)],
-        dark: &Array2<f32>,
+        frames: &[FilmImage],
+        dark: &FilmImage,
         go_on: &(dyn Fn() -> bool + Sync),
     ) -> Result<Transport, NotSolved> {
-        let mut stack = self.stack(frames, dark);
-        let choices = self.learned.as_ref().unwrap_or(&self.planned);
-        choices.solve(0..self.geometry.height, 0, &mut stack, go_on).map_err(not_solved)
+        let known = self.learned.as_ref().unwrap_or(&self.planned);
+        let mut stack = self.stack(known, frames, dark);
+        known.choices.solve(0..self.geometry.height, 0, &mut stack, go_on).map_err(not_solved)
     }
 
     /// The stack from which the transport of a cycle was solved, for its products; the number of cycles solved before it
@@ -213,12 +253,13 @@ impl FilmSolver {
     pub fn solved_stack(
         &self,
         (cycles_before, is_judged): (usize, bool),
-        frames: &[(Setting, Arc<Array2<f32>>)],
-        dark: &Array2<f32>,
+        frames: &[FilmImage],
+        dark: &FilmImage,
     ) -> Result<SweepStack, NotSolved> {
         let learned = self.learned.as_ref();
-        let choices = learned.filter(|_| cycles_before >= Self::FIRST_CYCLES).unwrap_or(&self.planned);
-        let mut stack = self.stack(frames, dark);
+        let known = learned.filter(|_| cycles_before >= Self::FIRST_CYCLES).unwrap_or(&self.planned);
+        let (choices, learned) = (&known.choices, learned.map(|learned| &learned.choices));
+        let mut stack = self.stack(known, frames, dark);
         if is_judged {
             choices.prepare(&(0..self.geometry.height), 0, &mut stack, &|| true).map_err(not_solved)?;
             stack.noise = learned.and_then(Choices::noise_without_darks);
@@ -235,59 +276,94 @@ impl FilmSolver {
     ///
     /// # Errors
     /// If their mean does not give a valid model; then the cycles after them are demultiplexed as planned, too.
-    pub fn learn(
-        &mut self,
-        frames: &[(Setting, Arc<Array2<f32>>)],
-        dark: &Array2<f32>,
-    ) -> Option<Result<&Findings, NotSolved>> {
+    pub fn learn(&mut self, frames: &[FilmImage], dark: &FilmImage) -> Option<Result<&Findings, NotSolved>> {
         let mut first = self.first.take()?;
-        first.add(self.stack(frames, dark));
+        let stack = self.stack(&self.planned, frames, dark);
+        let exposed = self.exposed(frames, dark);
+        if let Some((room, frames)) = &exposed {
+            first.unexplained.extend(room.unexplained(&stack, frames));
+            first.add_frames(frames);
+        }
+        first.add(stack);
         if first.cycles < Self::FIRST_CYCLES {
             self.first = Some(first);
             return None;
         }
         let mut mean = first.sum?;
         mean.images /= first.cycles as f32;
+        let (mut lamp, mut said) = (None, RoomFindings::default());
+        if let Some((room, _)) = exposed
+            && first.unexplained.len() == first.cycles
+        {
+            (lamp, said) = FilmLamp::find(&room, &first.unexplained, &first.frames);
+            if let Some(lamp) = &lamp {
+                lamp.remove(&room, &first.frames, &mut mean);
+            }
+        }
         let rows = rows_to_choose_by(self.geometry.height);
         Some(match choose(&self.demux, &self.options, &self.geometry, &rows, mean.of_rows(&rows)) {
-            Ok(choices) => Ok(&self.learned.insert(choices).findings),
+            Ok(mut choices) => {
+                choices.findings.add_room(said);
+                Ok(&self.learned.insert(Known { choices, lamp }).choices.findings)
+            }
             Err(error) => Err(not_solved(error)),
         })
     }
 
-    /// These frames as the model sees them.
-    fn stack(&self, frames: &[(Setting, Arc<Array2<f32>>)], dark: &Array2<f32>) -> SweepStack {
+    /// The room in the dark image, and when these frames were exposed, on one clock; `None` if that was not stored.
+    fn exposed(&self, frames: &[FilmImage], dark: &FilmImage) -> Option<(FilmRoom<'_>, Vec<FrameExposures>)> {
+        let zero_ns = *dark.starts_ns.first()?;
+        let since_s = |start_ns: &i64| start_ns.saturating_sub(zero_ns) as f64 * 1e-9;
+        let exposures = |image: &FilmImage| FrameExposures {
+            exposure_us: image.setting.exposure_us,
+            opened_s: image.starts_ns.iter().map(since_s).collect(),
+        };
+        let is_known = frames.iter().all(|frame| !frame.starts_ns.is_empty());
+        is_known.then(|| {
+            let room = FilmRoom::new(&self.geometry, &self.scale, &dark.counts, exposures(dark));
+            (room, frames.iter().map(exposures).collect())
+        })
+    }
+
+    /// These frames as the model sees them, without the lamp that is known.
+    fn stack(&self, known: &Known, frames: &[FilmImage], dark: &FilmImage) -> SweepStack {
         let is_unsaturated = |counts: f32| f64::from(counts) < self.geometry.saturation_dn;
         let shape = (frames.len(), self.geometry.height, self.geometry.width);
         let saturates =
-            || frames.iter().any(|(_, image)| image.iter().any(|&counts| !is_unsaturated(counts)));
+            || frames.iter().any(|frame| frame.counts.iter().any(|&counts| !is_unsaturated(counts)));
         let is_masked = self.measured.iter().any(|measured| !measured) || saturates();
         let mut valid = is_masked.then(|| Array3::from_elem(shape, true));
         let mut images = Array3::zeros(shape);
-        for (index, (_, image)) in frames.iter().enumerate() {
+        let dark_view = dark.counts.view();
+        for (index, FilmImage { counts, .. }) in frames.iter().enumerate() {
             if let Some(valid) = &mut valid {
-                valid.index_axis_mut(Axis(0), index).assign(&(image.mapv(is_unsaturated) & &self.measured));
+                valid.index_axis_mut(Axis(0), index).assign(&(counts.mapv(is_unsaturated) & &self.measured));
             }
-            images.index_axis_mut(Axis(0), index).assign(&self.scale.light(image.view(), dark.view()));
+            images.index_axis_mut(Axis(0), index).assign(&self.scale.light(counts.view(), dark_view));
         }
-        let setting = |(setting, image): &(Setting, Arc<Array2<f32>>)| {
+        let setting = |FilmImage { setting, counts, .. }: &FilmImage| {
             let setting = self.geometry.setting(&setting.delays_us, setting.exposure_us);
             let late_us = self.strip.as_ref().and_then(|strip| {
-                let [image, dark] = [image.view(), dark.view()];
-                strip.late_us(&setting, strip.of_image(&image), strip.of_image(&dark))
+                strip.late_us(&setting, strip.of_image(&counts.view()), strip.of_image(&dark_view))
             });
             let late_us = late_us.unwrap_or(self.geometry.unseen_jitter(&setting));
             (setting.earlier(late_us.value), late_us.sd)
         };
-        let exposures_us = frames.iter().map(|(setting, _)| setting.exposure_us).collect();
+        let exposures_us = frames.iter().map(|frame| frame.setting.exposure_us).collect();
         let (settings, delay_sds_us) = frames.iter().map(setting).unzip();
-        SweepStack {
+        let mut stack = SweepStack {
             exposures_us,
             dark_frames: vec![self.dark_frames; frames.len()],
             delay_sds_us,
             valid,
             ..SweepStack::new(self.demux.timing().clone(), self.demux.prior(), settings, images)
+        };
+        if let Some(lamp) = &known.lamp
+            && let Some((room, frames)) = self.exposed(frames, dark)
+        {
+            lamp.remove(&room, &frames, &mut stack);
         }
+        stack
     }
 }
 
@@ -296,6 +372,16 @@ fn not_solved(error: PlaneError) -> NotSolved {
 }
 
 impl FirstCycles {
+    fn add_frames(&mut self, frames: &[FrameExposures]) {
+        if self.frames.is_empty() {
+            self.frames = frames.to_vec();
+            return;
+        }
+        for (all, frames) in self.frames.iter_mut().zip(frames) {
+            all.opened_s.extend(&frames.opened_s);
+        }
+    }
+
     fn add(&mut self, cycle: SweepStack) {
         self.cycles += 1;
         let Some(sum) = &mut self.sum else {

@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use ndarray::{Array2, ArrayViewMut2};
 use raysweep_core::ns_from_us;
 use raysweep_transport::plane::calibrate::{
-    DarkFlicker, DarkRows, FrameExposures, LampFlicker, Sample, TimedImage, can_be_followed,
+    DarkFlicker, DarkRows, FrameExposures, LampFlicker, Sample, TimedImage, Unexplained, can_be_followed,
     cancelling_frames,
 };
 
@@ -22,7 +22,7 @@ pub(crate) struct FrameStamps {
 }
 
 /// Light of the room, of white in a row's time, that is too weak to matter even if all of it flickers.
-const DARK_ROOM: f64 = 2e-5;
+pub(crate) const DARK_ROOM: f64 = 2e-5;
 /// Largest amplitude that may remain, of white in a row's time.
 const MOST_FLICKER: f64 = 0.0005;
 /// A dark image with a larger share of saturated pixels is not used.
@@ -46,6 +46,24 @@ pub(crate) struct RoomFlicker {
 pub(crate) struct RoomFindings {
     pub remark: Option<(&'static str, String)>,
     pub warning: Option<String>,
+}
+
+impl RoomFindings {
+    /// A lamp in step with the frames.
+    pub(crate) fn in_step(frequency_hz: f64, amplitude: f64, rate_hz: f64) -> Self {
+        let warning = (amplitude > MOST_FLICKER).then(|| format!(
+            "the room's light flickers at {frequency_hz:.1} Hz by {amplitude:.4} of white in a row's time. That is the same in all frames at {rate_hz:.1} frames/s, so it cannot be told from the scene, and no number of frames cancels it: switch the lamp off, or use one that does not flicker"
+        ));
+        Self { remark: None, warning }
+    }
+
+    /// A lamp of which only some of the images show that it flickers.
+    pub(crate) fn unsteady(frequency_hz: f64, seen_in: &str, unseen_in: &str) -> Self {
+        let warning = format!(
+            "{seen_in} that the room's light flickers at {frequency_hz:.2} Hz, but {unseen_in} the same flicker, so nothing was removed: leave the lamps alone during a run, or switch them off"
+        );
+        Self { remark: None, warning: Some(warning) }
+    }
 }
 
 /// The exposures of all points on one clock, on which the runs of the session follow each other; `None` if those of a
@@ -74,8 +92,8 @@ pub(crate) fn on_one_clock<'a>(
 }
 
 /// Most frequent time between consecutive frames, as a rate.
-fn frame_rate_hz(times: &BTreeMap<PointRole, FrameExposures>) -> Option<f64> {
-    let steps = times.values().flat_map(|frames| frames.opened_s.windows(2).map(|pair| pair[1] - pair[0]));
+pub(crate) fn frame_rate_hz<'a>(images: impl Iterator<Item = &'a FrameExposures>) -> Option<f64> {
+    let steps = images.flat_map(|frames| frames.opened_s.windows(2).map(|pair| pair[1] - pair[0]));
     let mut steps: Vec<f64> = steps.filter(|step| *step > 0.0).collect();
     steps.sort_by(f64::total_cmp);
     steps.get(steps.len() / 2).map(|step| 1.0 / step)
@@ -199,14 +217,13 @@ impl<'a> RoomImages<'a> {
         roles: &[(PointRole, PointRole)],
         frames: u32,
     ) -> (Option<RoomFlicker>, RoomFindings) {
-        let Some(rate_hz) = frame_rate_hz(&self.times) else { return (None, RoomFindings::default()) };
+        let Some(rate_hz) = frame_rate_hz(self.times.values()) else {
+            return (None, RoomFindings::default());
+        };
         let &SeenFlicker { frequency_hz, share, level } = seen;
         if !can_be_followed(frequency_hz, rate_hz) {
             let amplitude = level * share.unwrap_or(1.0);
-            let warning = (amplitude > MOST_FLICKER).then(|| format!(
-                "the room's light flickers at {frequency_hz:.1} Hz by {amplitude:.4} of white in a row's time. That is the same in all frames at {rate_hz:.1} frames/s, so it cannot be told from the scene, and no number of frames cancels it: switch the lamp off, or use one that does not flicker"
-            ));
-            return (None, RoomFindings { remark: None, warning });
+            return (None, RoomFindings::in_step(frequency_hz, amplitude, rate_hz));
         }
         match self.fitted(seen, stack, roles) {
             Some(lamp) if lamp.is_seen() => {
@@ -218,12 +235,10 @@ impl<'a> RoomImages<'a> {
                 (Some(room), RoomFindings { remark: Some(("room light", said)), warning: None })
             }
             _ if share.is_none() => (None, RoomFindings::default()),
-            _ => {
-                let warning = format!(
-                    "the dark images show that the room's light flickers at {frequency_hz:.2} Hz, but the sweep does not show the same flicker, so nothing was removed: leave the lamps alone during a run, or switch them off"
-                );
-                (None, RoomFindings { remark: None, warning: Some(warning) })
-            }
+            _ => (
+                None,
+                RoomFindings::unsteady(frequency_hz, "the dark images show", "the sweep does not show"),
+            ),
         }
     }
 
@@ -258,7 +273,9 @@ impl<'a> RoomImages<'a> {
             let of_pixels: Vec<f64> = of_pixels.collect();
             let lamp =
                 (found.as_ref().map_or(seen.frequency_hz, |found| found.frequency_hz), self.row_time_s());
-            found = Some(LampFlicker::follow(&sample, beam_sigma_rows, &timed, &of_pixels, lamp).ok()?);
+            let unexplained =
+                Unexplained::of_sweep(&sample, beam_sigma_rows, timed.clone(), &of_pixels).ok()?;
+            found = Some(LampFlicker::follow(&[unexplained], lamp).ok()?);
         }
         found
     }
@@ -316,10 +333,16 @@ impl RoomFlicker {
             Some(enough) => format!("; the mean of {enough} frames instead of {frames} would cancel it"),
             None => "; no number of frames up to 64 would cancel it".into(),
         };
-        format!(
-            "{level:.4} of white in a row's time, {percent:.1} % of it flickering at {frequency_hz:.2} Hz: removed by the times of the frames, as much as {removed_us:.1} us of it in each image (root mean square){cure}"
-        )
+        let removed = say_removed(level, percent, frequency_hz, "the times of the frames", removed_us);
+        removed + &cure
     }
+}
+
+/// What is said of a lamp that was removed.
+pub(crate) fn say_removed(level: f64, percent: f64, frequency_hz: f64, by: &str, removed_us: f64) -> String {
+    format!(
+        "{level:.4} of white in a row's time, {percent:.1} % of it flickering at {frequency_hz:.2} Hz: removed by {by}, as much as {removed_us:.1} us of it in each image (root mean square)"
+    )
 }
 
 /// The time stamps of a unit's frames; `None` if they were not stored.

@@ -5,11 +5,11 @@ use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2, s};
 use rayon::prelude::*;
+use raysweep_transport::plane::board::Estimate;
 use raysweep_transport::plane::board::times::{JitterGauge, Lateness};
-use raysweep_transport::plane::board::{CameraCurve, Estimate};
 use raysweep_transport::plane::{PlaneError, Setting};
 
-use crate::scale::LightScale;
+use crate::scale::{CameraCurve, LightScale};
 use crate::schedule::{PointRole, SweepGeometry};
 
 /// Largest accepted misfit of what should be the board, in units of its variance: what a calibration accepts.
@@ -60,10 +60,9 @@ impl StripGauge {
         let centre_us = raster.row_centre_us(geometry.first_row);
         let gauge = JitterGauge::new(calibration, strip, raster.period_us, centre_us)?;
         let white_dn = calibration.white_dn.slice(s![.., gauge.columns()]).mapv(f64::from);
-        let curve = calibration.curve.as_ref().map(|CameraCurve { per_dn, zero_dn }| CameraCurve {
-            per_dn: *per_dn,
-            zero_dn: zero_dn.slice(s![.., gauge.columns()]).to_owned(),
-        });
+        let zero_dn = || calibration.dark_offset_dn.slice(s![.., gauge.columns()]).to_owned();
+        let curve = calibration.linearity_per_dn;
+        let curve = curve.map(|per_dn| CameraCurve { per_dn, zero_dn: zero_dn() });
         let scale = LightScale::new(&white_dn, curve);
         Ok(Some(Self { gauge: Arc::new(gauge), scale: Arc::new(scale), jitter_us: strip.jitter_us }))
     }

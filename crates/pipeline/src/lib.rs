@@ -33,7 +33,7 @@ pub use assembler::{
 };
 pub use demux::{DEMUX, DemuxFold, DemuxOptions, PREDICTED_SHARE, Snapshot, Solved, SweepSummary};
 pub use edges::{EdgeTracker, Found, Line};
-pub use film::{Cycle, CycleOrder, FilmFrame, FilmSolver};
+pub use film::{Cycle, CycleOrder, FilmFrame, FilmImage, FilmSolver};
 pub use findings::{Findings, name as prior_name, rows_to_choose_by};
 pub use light::SeenLight;
 pub use pipeline::{Ordered, Pipeline, PipelineConfig, PipelineError, Sink};

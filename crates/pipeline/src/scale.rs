@@ -1,7 +1,15 @@
 //! From counts to light.
 
 use ndarray::{Array2, ArrayView2, Zip};
-use raysweep_transport::plane::board::CameraCurve;
+
+/// The curve of a camera: `DN (1 + a DN)` is proportional to the light, DN counting from an exposure of 0.
+#[derive(Debug, Clone)]
+pub(crate) struct CameraCurve {
+    /// `a`.
+    pub per_dn: f64,
+    /// Counts at an exposure of 0, `[t, s]`.
+    pub zero_dn: Array2<f32>,
+}
 
 /// What converts the counts of some pixels to light.
 #[derive(Debug, Clone)]
@@ -14,7 +22,7 @@ pub struct LightScale {
 impl LightScale {
     /// The scale of pixels that have these counts under white, `[t, s]`, infinite where no light is to be found, on a
     /// camera with this curve.
-    pub fn new(white_dn: &Array2<f64>, curve: Option<CameraCurve>) -> Self {
+    pub(crate) fn new(white_dn: &Array2<f64>, curve: Option<CameraCurve>) -> Self {
         Self { per_dn: white_dn.mapv(|dn| (1.0 / dn) as f32), curve }
     }
 

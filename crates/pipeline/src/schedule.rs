@@ -4,12 +4,12 @@ use std::sync::Arc;
 
 use ndarray::{Array2, Axis};
 use raysweep_core::{CameraSettings, Raster, Shutter};
-use raysweep_transport::plane::board::{BoardCalibration, CameraCurve, Estimate, RowDrawing};
+use raysweep_transport::plane::board::{BoardCalibration, Estimate, RowDrawing};
 use raysweep_transport::plane::calibrate::{FlyingSpot, Scan};
 use raysweep_transport::plane::{Beam, CameraRows, PlaneError, RowTiming, Setting};
 use serde::Deserialize;
 
-use crate::scale::LightScale;
+use crate::scale::{CameraCurve, LightScale};
 
 /// The purpose of a point's image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -99,9 +99,11 @@ pub struct SweepGeometry {
     /// Counts above black that a white pixel collects in the time of one projector row; with a calibration, the median
     /// of its pixels.
     pub white_dn: f64,
+    /// Counts without light, as the rig file says.
+    pub black_dn: f64,
     /// Counts from which a pixel is saturated.
     pub saturation_dn: f64,
-    /// What a calibration measured, in place of row table, beam and white level.
+    /// What a calibration measured, in place of row table, beam, white and black level.
     pub calibration: Option<Arc<BoardCalibration>>,
 }
 
@@ -204,12 +206,19 @@ impl SweepGeometry {
         calibration.white_dn.select(Axis(0), rows).mapv(white)
     }
 
+    /// Counts of each pixel at an exposure of 0, `[t, s]`.
+    pub fn dark_offset_dn(&self) -> Array2<f32> {
+        match &self.calibration {
+            Some(calibration) => calibration.dark_offset_dn.clone(),
+            None => Array2::from_elem((self.height, self.width), self.black_dn as f32),
+        }
+    }
+
     /// What converts the counts of these camera rows to light.
     pub fn scale_of(&self, rows: &[usize]) -> LightScale {
-        let curve = self.calibration.as_ref().and_then(|calibration| calibration.curve.as_ref());
-        let curve = curve.map(|CameraCurve { per_dn, zero_dn }| CameraCurve {
-            per_dn: *per_dn,
-            zero_dn: zero_dn.select(Axis(0), rows),
+        let curve = self.calibration.as_ref().and_then(|calibration| {
+            let zero_dn = || calibration.dark_offset_dn.select(Axis(0), rows);
+            calibration.linearity_per_dn.map(|per_dn| CameraCurve { per_dn, zero_dn: zero_dn() })
         });
         LightScale::new(&self.white_of(rows), curve)
     }

@@ -332,6 +332,10 @@ pub struct CycleEntry {
     pub exposure_us: f64,
     /// The true delay of each setting's frame in us, from its exposure start and its VSYNC edge.
     pub delays_us: Vec<f64>,
+    /// Start of the exposure of camera row 0 in each setting's frame, in ns on the clock of frames and edges; empty in
+    /// sessions from before it was stored.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub starts_ns: Vec<i64>,
     /// What became of its triggers.
     pub counts: raysweep_core::Counts,
     /// CRC-32 of the stored frames, see [`crc32`].

@@ -6,14 +6,15 @@ mod common;
 
 use std::f64::consts::TAU;
 
-use common::{ideal_stack, paper_sweep, photographed, timing};
+use common::{ideal_stack, paper_sweep, photographed, photographed_in, timing};
 use ndarray::{Array3, s};
 use rand_distr::{Distribution, Normal, Uniform};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use rand_xoshiro::rand_core::SeedableRng;
+use raysweep_transport::plane::Setting;
 use raysweep_transport::plane::calibrate::{
-    DarkFlicker, DarkRows, FrameExposures, LampFlicker, Sample, TimedImage, averaged_share, can_be_followed,
-    cancelling_frames,
+    CycleFlicker, DarkFlicker, DarkRows, FrameExposures, LampFlicker, Sample, TimedImage, Unexplained,
+    averaged_share, can_be_followed, cancelling_frames,
 };
 
 const ROW_TIME_S: f64 = 22.22e-6;
@@ -109,7 +110,8 @@ fn followed(
     }
     let sample = Sample::new(timing(), settings, with.view(), None).unwrap();
     let levels: Vec<f64> = sample.pixels().map(|(t, s)| level(t, s)).collect();
-    let lamp = LampFlicker::follow(&sample, 0.0, &images, &levels, (99.95, ROW_TIME_S)).unwrap();
+    let unexplained = Unexplained::of_sweep(&sample, 0.0, images.clone(), &levels).unwrap();
+    let lamp = LampFlicker::follow(&[unexplained], (99.95, ROW_TIME_S)).unwrap();
     let mut corrected = with.clone();
     for (image, timed) in images.iter().enumerate() {
         for t in 0..128 {
@@ -148,6 +150,74 @@ fn what_has_another_phase_in_each_image_is_no_lamp() {
     let drawn = |image: usize, time_s: f64| 1.0 + (TAU * (100.0 * time_s + turns[image])).cos();
     let (_, _, lamp, _) = followed(&drawn);
     assert!(!lamp.is_seen(), "{lamp:?}");
+}
+
+/// The default film's delays.
+const DELAYS_US: [f64; 15] = [
+    -1500.0, -1000.0, -640.0, -420.0, -333.0, -311.0, -289.0, 0.0, 289.0, 311.0, 333.0, 420.0, 640.0, 1000.0,
+    1500.0,
+];
+
+/// Four cycles of a film of the corner in a room with this light, at 60 frames/s. Their delays jitter by 5 us and are
+/// measured, or not.
+fn cycles(light: &dyn Fn(f64) -> f64, is_measured: bool) -> Vec<Unexplained> {
+    let scene = common::corner().slice_move(s![.., .., ..;4]);
+    let mut random = Xoshiro256PlusPlus::seed_from_u64(7);
+    let jitter = Normal::new(0.0, 5.0).unwrap();
+    let cycle = |number: usize| {
+        let settings =
+            DELAYS_US.map(|delay_us| Setting::new(delay_us + jitter.sample(&mut random), 600.0)).to_vec();
+        let opened_s = |k: usize| (15 * number + 14 - k) as f64 / 60.0 + DELAYS_US[k] * 1e-6;
+        let frame = |k: usize| FrameExposures { exposure_us: 600.0, opened_s: vec![2.0 + opened_s(k)] };
+        let frames: Vec<FrameExposures> = (0..15).map(frame).collect();
+        let mut images = photographed_in(1, &ideal_stack(&scene, &settings), number as u64);
+        for (k, frame) in frames.iter().enumerate() {
+            for t in 0..128 {
+                let more = LEVEL_US * (collected(frame, t, light) - frame.exposure_us);
+                images.slice_mut(s![k, t, ..]).mapv_inplace(|value| value + more as f32);
+            }
+        }
+        let planned = || DELAYS_US.map(|delay_us| Setting::new(delay_us, 600.0)).to_vec();
+        let stated = if is_measured { settings } else { planned() };
+        let sample = Sample::new(timing(), stated, images.view(), None).unwrap();
+        let levels = vec![LEVEL_US; sample.pixels().count()];
+        Unexplained::of_cycle(&sample, 0.0, &frames, &levels).unwrap()
+    };
+    (0..4).map(cycle).collect()
+}
+
+#[test]
+fn cycles_show_a_lamp_even_if_all_of_them_see_it_in_the_same_phase() {
+    // A cycle takes a quarter of a second: 25 periods of 100 Hz.
+    for frequency_hz in [100.0, 99.0, 143.0] {
+        let cycles = cycles(&|time_s| 1.0 + 0.9 * (TAU * frequency_hz * time_s + 0.7).cos(), true);
+        let found = CycleFlicker::find(&cycles, ROW_TIME_S, None).unwrap();
+        assert!((found.frequency_hz - frequency_hz).abs() < 0.02, "{found:?} of {frequency_hz}");
+        assert!((found.share - 0.9).abs() < 0.02, "{found:?}");
+        let expected = CycleFlicker::find(&cycles, ROW_TIME_S, Some(frequency_hz + 0.1)).unwrap();
+        assert!((expected.frequency_hz - found.frequency_hz).abs() < 0.01, "{expected:?} and {found:?}");
+        for cycle in &cycles {
+            let lamp = LampFlicker::follow(std::slice::from_ref(cycle), (found.frequency_hz, ROW_TIME_S));
+            let lamp = lamp.unwrap();
+            assert!(lamp.is_seen() && (lamp.share() - 0.9).abs() < 0.02, "{lamp:?}");
+        }
+    }
+}
+
+#[test]
+fn cycles_show_a_lamp_in_step_with_the_frames() {
+    let cycles = cycles(&|time_s| 1.0 + 0.9 * (TAU * 120.0 * time_s + 0.7).cos(), true);
+    let found = CycleFlicker::find(&cycles, ROW_TIME_S, None).unwrap();
+    assert!(!can_be_followed(found.frequency_hz, 60.0), "{found:?}");
+}
+
+#[test]
+fn jitter_is_no_lamp() {
+    for is_measured in [true, false] {
+        let cycles = cycles(&|_| 1.0, is_measured);
+        assert_eq!(CycleFlicker::find(&cycles, ROW_TIME_S, None), None);
+        assert_eq!(CycleFlicker::find(&cycles, ROW_TIME_S, Some(100.0)), None);
+    }
 }
 
 #[test]

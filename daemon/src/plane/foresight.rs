@@ -2,7 +2,7 @@
 
 use raysweep_config::ConfigError;
 use raysweep_core::CameraCapabilities;
-use raysweep_pipeline::{DemuxFold, Point, PointRole, SpotCut};
+use raysweep_pipeline::{DemuxFold, FilmSolver, Point, PointRole, SpotCut};
 use raysweep_processing::plane::PlaneTask;
 use raysweep_transport::plane::Setting;
 use raysweep_transport::plane::board::FlickeringLamp;
@@ -63,7 +63,7 @@ impl Model {
     }
 
     /// What the lamp that the calibration found does to a plan whose images are means of frames; `key` sets their
-    /// number, and without one nothing removes the flicker.
+    /// number, and without one the plan is a film.
     pub fn lamp_warning(&self, task: &PlaneTask, key: Option<&str>) -> Option<String> {
         let FlickeringLamp { frequency_hz, amplitude } = task.geometry.calibration.as_ref()?.lamp?;
         if amplitude <= LEAST_FLICKER {
@@ -88,7 +88,10 @@ impl Model {
         let share = |&rate_hz: &f64| averaged_share(frequency_hz, rate_hz, frames);
         let percent = 100.0 * rates_hz.iter().map(share).fold(0.0, f64::max);
         let Some(key) = key else {
-            return Some(format!("{lamp}, which nothing removes from a film: switch the lamp off"));
+            return Some(format!(
+                "{lamp}, which the times of the frames should remove from all cycles of a film but the first {}: switch the lamp off",
+                FilmSolver::FIRST_CYCLES
+            ));
         };
         match cancelling_frames(frequency_hz, &rates_hz, frames) {
             Some(enough) if enough == frames => None,

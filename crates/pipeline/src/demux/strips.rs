@@ -105,7 +105,7 @@ fn not_read(what: String) -> NotSolved {
 mod tests {
     use ndarray::{Array2, concatenate, s};
     use raysweep_core::{Counts, Raster, SettingsId};
-    use raysweep_transport::plane::board::{BoardCalibration, CalibrationCovariance, CameraCurve, Estimate};
+    use raysweep_transport::plane::board::{BoardCalibration, CalibrationCovariance, Estimate};
     use raysweep_transport::plane::{NoiseModel, PixelResponse, RESPONSE_ROWS, Setting};
 
     use super::*;
@@ -136,6 +136,7 @@ mod tests {
             height: HEIGHT,
             width: WIDTH,
             white_dn: 1000.0,
+            black_dn: 100.0,
             saturation_dn: 3900.0,
             calibration: None,
         }
@@ -275,7 +276,8 @@ mod tests {
             drawing: None,
             white_dn,
             saturation_dn: None,
-            curve: Some(CameraCurve { per_dn: 1e-5, zero_dn: Array2::from_elem((HEIGHT, WIDTH), 100.0) }),
+            dark_offset_dn: Array2::from_elem((HEIGHT, WIDTH), 100.0),
+            linearity_per_dn: Some(1e-5),
             noise: NoiseModel { read_variance: 0.0, gain: 0.0 },
             strip: None,
             lamp: None,

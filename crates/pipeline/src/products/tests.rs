@@ -26,6 +26,7 @@ fn geometry() -> SweepGeometry {
         height: 6,
         width: 3,
         white_dn: 1000.0,
+        black_dn: 0.0,
         calibration: None,
         saturation_dn: 4000.0,
     }

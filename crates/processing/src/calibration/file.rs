@@ -8,8 +8,7 @@ use raysweep_config::{ConfigError, RigFile};
 use raysweep_core::{CameraCapabilities, io_text};
 use raysweep_session::{durable, input};
 use raysweep_transport::plane::board::{
-    BoardCalibration, BoardStrip, CalibrationCovariance, CalibrationParameter, CameraCurve, Estimate,
-    RowDrawing,
+    BoardCalibration, BoardStrip, CalibrationCovariance, CalibrationParameter, Estimate, RowDrawing,
 };
 use raysweep_transport::plane::calibrate::FlyingSpot;
 use raysweep_transport::plane::{NoiseModel, PixelResponse};
@@ -162,11 +161,8 @@ impl KeptCalibration {
             response,
             drawing: self.drawing(),
             white_dn: self.arrays.white_dn.clone(),
-            curve: self
-                .header
-                .light
-                .linearity_per_dn
-                .map(|[per_dn, _]| CameraCurve { per_dn, zero_dn: self.arrays.dark_offset_dn.clone() }),
+            dark_offset_dn: self.arrays.dark_offset_dn.clone(),
+            linearity_per_dn: self.header.light.linearity_per_dn.map(|[per_dn, _]| per_dn),
             saturation_dn: self.header.light.saturation_dn,
             noise: NoiseModel { read_variance: (read_noise_e[0] / white_e).powi(2), gain: white_e.recip() },
             strip,

@@ -1,15 +1,15 @@
 //! The stored frames of a film, after all stages.
 
+use std::iter;
 use std::sync::Arc;
 
 use ndarray::{Array2, Axis, Zip};
 use raysweep_core::{Counts, SettingsId};
-use raysweep_pipeline::{Point, Stages, Unit, run_stages};
+use raysweep_pipeline::{FilmImage, Point, Stages, Unit, run_stages};
 use raysweep_session::film::{CycleEntry, Film, crc32};
 use raysweep_session::ledger::State;
 use raysweep_session::stack::ArrayName;
 use raysweep_session::{Result, Session, stack};
-use raysweep_transport::plane::Setting;
 
 use super::task::FilmTask;
 use crate::plane::unit_of;
@@ -24,13 +24,13 @@ pub(super) struct StoredFrames<'a> {
     task: &'a FilmTask,
     stages: &'a Stages,
     /// The image without light.
-    pub dark: Array2<f32>,
+    pub dark: FilmImage,
 }
 
 /// One cycle.
 pub(super) struct StoredCycle {
     /// The frames in the settings' order, after all stages.
-    pub frames: Vec<(Setting, Arc<Array2<f32>>)>,
+    pub frames: Vec<FilmImage>,
     /// Which pixels a stage replaced in some frame, `[t, s]`.
     pub filled: Array2<bool>,
 }
@@ -51,8 +51,9 @@ impl<'a> StoredFrames<'a> {
         if stack::crc32(sum.view()) != entry.crc32 {
             return Ok(None);
         }
-        let Ok(dark) = run_stages(stages, &unit_of(0, entry, sum, None)) else { return Ok(None) };
-        Ok(Some(Self { film: session.film()?, task, stages, dark }))
+        let unit = unit_of(0, entry, sum, None);
+        let Ok(dark) = run_stages(stages, &unit) else { return Ok(None) };
+        Ok(Some(Self { film: session.film()?, task, stages, dark: FilmImage::of(&unit, dark) }))
     }
 
     /// Reads a cycle, or says what is wrong with it.
@@ -63,23 +64,30 @@ impl<'a> StoredFrames<'a> {
             Ok(_) => return Err(format!("cycle {cycle} is damaged: its checksum differs from the ledger's")),
             Err(error) => return Err(format!("cycle {cycle} is damaged ({error})")),
         };
-        let mut filled = Array2::from_elem(self.dark.dim(), false);
-        let settings = raw.axis_iter(Axis(0)).zip(self.task.task.settings()).zip(&entry.delays_us);
-        let frames = settings.map(|((raw, point), &delay_us)| {
-            let unit = unit(point, entry, delay_us, raw.mapv(u32::from));
+        let mut filled = Array2::from_elem(self.dark.counts.dim(), false);
+        let starts_ns = entry.starts_ns.iter().map(|&start_ns| vec![start_ns]);
+        let times = entry.delays_us.iter().zip(starts_ns.chain(iter::repeat(Vec::new())));
+        let settings = raw.axis_iter(Axis(0)).zip(self.task.task.settings()).zip(times);
+        let frames = settings.map(|((raw, point), (&delay_us, starts_ns))| {
+            let unit = unit(point, entry, (delay_us, starts_ns), raw.mapv(u32::from));
             let image = run_stages(self.stages, &unit).map_err(|error| format!("cycle {cycle}: {error}"))?;
             Zip::from(&mut filled)
                 .and(&raw)
                 .and(&image)
                 .for_each(|filled, &raw, &image| *filled |= f32::from(raw) != image);
-            Ok((Setting::new(delay_us, entry.exposure_us), Arc::new(image)))
+            Ok(FilmImage::of(&unit, image))
         });
         let frames = frames.collect::<std::result::Result<_, String>>()?;
         Ok(StoredCycle { frames, filled })
     }
 }
 
-fn unit((ordinal, point): (u32, &Point), entry: &CycleEntry, delay_us: f64, sum: Array2<u32>) -> Unit {
+fn unit(
+    (ordinal, point): (u32, &Point),
+    entry: &CycleEntry,
+    (delay_us, starts_ns): (f64, Vec<i64>),
+    sum: Array2<u32>,
+) -> Unit {
     Unit {
         id: SettingsId { point: ordinal, attempt: entry.cycle as u32 },
         frames: 1,
@@ -87,7 +95,7 @@ fn unit((ordinal, point): (u32, &Point), entry: &CycleEntry, delay_us: f64, sum:
         exposure_us: entry.exposure_us,
         delays_us: vec![delay_us],
         run: 0,
-        starts_ns: Vec::new(),
+        starts_ns,
         sum: Arc::new(sum),
         clipped: None,
         counts: Counts::default(),

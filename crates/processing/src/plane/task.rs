@@ -78,6 +78,7 @@ impl PlaneTask {
             height: size.0,
             width: size.1,
             white_dn: rig.camera.white_dn(),
+            black_dn: rig.camera.black_dn(),
             saturation_dn: saturation_dn(rig.camera.pixel_format),
             calibration: None,
         };

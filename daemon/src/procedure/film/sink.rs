@@ -5,12 +5,13 @@ use std::time::{Duration, Instant};
 
 use ndarray::{Array2, Array3, Axis};
 use raysweep_core::{Counts, LossCause, SettingsId};
-use raysweep_pipeline::{Cycle, FilmFrame, Ordered, PipelineError, SeenLight, Sink, StageError, Unit};
+use raysweep_pipeline::{
+    Cycle, FilmFrame, FilmImage, Ordered, PipelineError, SeenLight, Sink, StageError, Unit,
+};
 use raysweep_processing::plane::PlaneTask;
 use raysweep_proto::Event;
 use raysweep_session::film::{CycleEntry, Film, crc32};
 use raysweep_session::ledger::Entry;
-use raysweep_transport::plane::Setting;
 
 use super::worker::{Account, CycleFrames, Worker};
 use crate::plane::PointSink;
@@ -36,7 +37,7 @@ pub struct Cycles {
     /// Ordinal of the cycle's first setting in the schedule.
     first_ordinal: u32,
     settings: usize,
-    dark: Option<Arc<Array2<f32>>>,
+    dark: Option<FilmImage>,
     /// The cycle in progress.
     cycle: Option<Cycle>,
     /// The newest frame of each setting that has an image.
@@ -91,8 +92,8 @@ impl Cycles {
     }
 
     /// Stores the dark image, which every transport needs.
-    pub fn note_dark(&mut self, image: &Array2<f32>) {
-        self.dark = Some(Arc::new(image.clone()));
+    pub fn note_dark(&mut self, unit: &Unit, image: &Array2<f32>) {
+        self.dark = Some(FilmImage::of(unit, image.clone()));
     }
 
     /// Index of a point among the cycle's settings, if it is one.
@@ -116,19 +117,14 @@ impl Cycles {
         let dark = self.dark.as_ref().filter(|_| !self.is_lit)?;
         let images = cycle.frames.iter().flatten().filter_map(|frame| frame.image.as_ref());
         let seen = images.filter_map(|image| {
-            SeenLight::between(image.view(), dark.view(), self.white_dn, self.saturation_dn)
+            SeenLight::between(image.view(), dark.counts.view(), self.white_dn, self.saturation_dn)
         });
         let brightest = seen.max_by(|a, b| a.mean_dn.total_cmp(&b.mean_dn))?;
         self.is_lit = brightest.is_light();
         (!self.is_lit).then_some(brightest)
     }
 
-    fn exposed(
-        &self,
-        cycle: u32,
-        frames: Vec<(Setting, Arc<Array2<f32>>)>,
-        starts_ns: (i64, i64),
-    ) -> Option<CycleFrames> {
+    fn exposed(&self, cycle: u32, frames: Vec<FilmImage>, starts_ns: (i64, i64)) -> Option<CycleFrames> {
         let (oldest_ns, newest_ns) = starts_ns;
         Some(CycleFrames {
             cycle,
@@ -153,7 +149,7 @@ impl Cycles {
         };
         let left = (self.settings - decided) as f64 / self.settings as f64;
         let cycle_end = Instant::now() + Duration::from_secs_f64(left * self.timing.cycle_ns * 1e-9);
-        let Some(frames) = images_of(&newest) else { return };
+        let Some(frames) = newest.iter().map(|frame| frame.staged()).collect() else { return };
         if let Some(exposed) = self.exposed(number, frames, span_ns) {
             self.worker.sliding(exposed, cycle_end);
         }
@@ -185,7 +181,7 @@ impl Sink for FilmSink {
                 Some(setting) => self.frame(setting, &unit, &image),
                 None => {
                     if let Ok(image) = &image {
-                        self.film.note_dark(image);
+                        self.film.note_dark(&unit, image);
                     }
                     self.points.take(Ordered::Unit(unit, image));
                 }
@@ -301,6 +297,7 @@ impl FilmSink {
             start_s: film.seconds_since_start(first_ns),
             exposure_us: frames[0].setting.exposure_us,
             delays_us: frames.iter().flat_map(|frame| frame.setting.delays_us.clone()).collect(),
+            starts_ns: starts().collect(),
             counts: cycle.counts.clone(),
             crc32: crc32(raw.view()),
         });
@@ -308,7 +305,8 @@ impl FilmSink {
         write_patiently(orders, board, || film.film.write(cycle.number as usize, raw.view()))?;
         write_patiently(orders, board, || ledger.append(&entry))?;
         film.note_stored(first_ns);
-        match images_of(&frames).and_then(|images| film.exposed(cycle.number, images, (first_ns, last_ns))) {
+        let images: Option<Vec<FilmImage>> = frames.iter().map(|frame| frame.staged()).collect();
+        match images.and_then(|images| film.exposed(cycle.number, images, (first_ns, last_ns))) {
             Some(exposed) => film.worker.cycle(exposed),
             None => film.account.note(|film| film.transports_missing += 1),
         }
@@ -333,11 +331,6 @@ impl FilmSink {
         tracing::error!(%error, cycle, setting, "stored, but its cycle has no transport");
         self.points.processing.problems.push(format!("cycle {cycle}, setting {setting}: {error}"));
     }
-}
-
-/// The images of frames with their settings, if all have one.
-fn images_of(frames: &[&FilmFrame]) -> Option<Vec<(Setting, Arc<Array2<f32>>)>> {
-    frames.iter().map(|frame| Some((frame.setting.clone(), frame.image.clone()?))).collect()
 }
 
 /// Valid frames of a cycle that is not stored are counted separately from stored ones.

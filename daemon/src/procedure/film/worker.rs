@@ -5,13 +5,12 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use ndarray::Array2;
 use raysweep_core::{Clock, FilmSummary, Percentiles};
-use raysweep_pipeline::{FilmSolver, PipelineError};
+use raysweep_pipeline::{FilmImage, FilmSolver, PipelineError};
 use raysweep_processing::film::{note_findings, write_transport};
 use raysweep_proto::{Event, FilmEstimate};
 use raysweep_session::film::TransportFilm;
-use raysweep_transport::plane::{Setting, Transport};
+use raysweep_transport::plane::Transport;
 use serde_json::{Map, Value, json};
 
 use crate::devices::priority;
@@ -29,9 +28,9 @@ pub struct CycleFrames {
     /// The cycle of the newest frame.
     pub cycle: u32,
     /// The frames in the settings' order, after all stages.
-    pub frames: Vec<(Setting, Arc<Array2<f32>>)>,
+    pub frames: Vec<FilmImage>,
     /// The image without light.
-    pub dark: Arc<Array2<f32>>,
+    pub dark: FilmImage,
     /// Start of the oldest exposure, in seconds after the film's first.
     pub start_s: f64,
     /// End of the newest exposure's last row, on the host's clock.
@@ -315,10 +314,14 @@ impl Solving {
 
 #[cfg(test)]
 mod tests {
+    use raysweep_transport::plane::Setting;
+
     use super::*;
 
     fn exposed(cycle: u32) -> CycleFrames {
-        CycleFrames { cycle, frames: Vec::new(), dark: Arc::default(), start_s: 0.0, end_ns: 0 }
+        let dark =
+            FilmImage { setting: Setting::new(0.0, 1.0), starts_ns: Vec::new(), counts: Arc::default() };
+        CycleFrames { cycle, frames: Vec::new(), dark, start_s: 0.0, end_ns: 0 }
     }
 
     fn slide(inbox: &Inbox, cycle: u32, left: Duration) {

@@ -29,8 +29,11 @@ pub struct BoardCalibration {
     /// Counts above black that a pixel collects in one pass of a white picture, `[t, s]`; NaN where the board was not
     /// lit.
     pub white_dn: Array2<f32>,
-    /// The camera's curve; `None` for one that is taken as linear.
-    pub curve: Option<CameraCurve>,
+    /// Counts of each pixel at an exposure of 0, `[t, s]`.
+    pub dark_offset_dn: Array2<f32>,
+    /// `a` of the camera's curve: `DN (1 + a DN)` is proportional to the light, DN counting from `dark_offset_dn`; `None`
+    /// for a camera that is taken as linear.
+    pub linearity_per_dn: Option<f64>,
     /// Counts from which on a pixel is overexposed; `None` if it was not measured.
     pub saturation_dn: Option<f64>,
     /// Noise of one frame, in shares of white.
@@ -48,15 +51,6 @@ pub enum RowDrawing {
     Even,
     /// By a spot, with the columns at which pixels see the board. A scene at another distance is seen at others.
     Spot(FlyingSpot),
-}
-
-/// The curve of a camera: `DN (1 + a DN)` is proportional to the light, DN counting from an exposure of 0.
-#[derive(Debug, Clone, PartialEq)]
-pub struct CameraCurve {
-    /// `a`.
-    pub per_dn: f64,
-    /// Counts at an exposure of 0, `[t, s]`.
-    pub zero_dn: Array2<f32>,
 }
 
 /// The columns of the image in which the white board stays in view while a scene is measured.

@@ -12,6 +12,6 @@ mod estimate;
 pub mod images;
 pub mod times;
 
-pub use calibration::{BoardCalibration, BoardStrip, CameraCurve, FlickeringLamp, RowDrawing};
+pub use calibration::{BoardCalibration, BoardStrip, FlickeringLamp, RowDrawing};
 pub use covariance::{CalibrationCovariance, CalibrationParameter};
 pub use estimate::Estimate;

@@ -7,7 +7,7 @@
 //! pixel as logarithms, so that no model of the camera's noise is needed. If a stack does not determine a quantity, a
 //! [`CalibrateError`] explains why.
 //!
-//! [`DarkFlicker`] and [`LampFlicker`] are for rooms with a lamp that flickers.
+//! [`DarkFlicker`], [`CycleFlicker`] and [`LampFlicker`] are for rooms with a lamp that flickers.
 //!
 //! [`settings_on_direct_row`] and [`spike_weights`] are for projectors that draw their rows with a flying spot.
 
@@ -25,8 +25,8 @@ pub use super::model::{FlyingSpot, Scan, settings_on_direct_row, spike_weights};
 pub use beam::{BeamEstimate, OpticsEstimate, beam_sigma, estimate_optics};
 pub use error::CalibrateError;
 pub use flicker::{
-    DarkFlicker, DarkRows, FrameExposures, LampFlicker, TimedImage, averaged_share, can_be_followed,
-    cancelling_frames,
+    CycleFlicker, DarkFlicker, DarkRows, FrameExposures, LampFlicker, TimedImage, Unexplained,
+    averaged_share, can_be_followed, cancelling_frames,
 };
 pub use holdout::{Candidate, Choice, candidates, choose_prior};
 pub use latency::{LatencyEstimate, latency};

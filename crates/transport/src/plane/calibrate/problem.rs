@@ -2,7 +2,7 @@ use ndarray::{Array1, Array2, ArrayView2, Axis, s};
 use rayon::prelude::*;
 
 use super::super::solve::cholesky;
-use super::super::solve::pivot::{RUN_PX, Start, minimise};
+use super::super::solve::pivot::{RUN_PX, Start, minimise, minimise_free};
 use super::super::solve::quadratic::Quadratic;
 use super::super::{PlaneError, Prior, SimdLevel};
 
@@ -39,6 +39,14 @@ impl RowProblem {
     /// Those of [`Self::new`].
     pub fn inverse(&self) -> Result<ArrayView2<'_, f64>, PlaneError> {
         self.quadratic.inverse()
+    }
+
+    /// The hat matrix `A H^-1 A'`, shape `[settings, settings]`: the part of a pixel's samples that the prior explains,
+    /// whatever the sign of its light.
+    pub fn hat(&self) -> Array2<f64> {
+        let free = Array2::from_elem(self.weights.dim(), true);
+        let solved = minimise_free(SimdLevel::best(), &self.quadratic, self.weights.clone(), free.view());
+        self.weights.dot(&solved.t())
     }
 
     /// Minimisers of several pixels, shape `[pixels, slots]`, from `samples`, `[pixels, settings]`. The search starts
