@@ -111,7 +111,9 @@ impl FilmImage {
     /// A unit's image.
     pub fn of(unit: &Unit, counts: Array2<f32>) -> Self {
         let setting = Setting { delays_us: unit.delays_us.clone(), exposure_us: unit.exposure_us };
-        Self { setting, starts_ns: unit.starts_ns.clone(), counts: Arc::new(counts) }
+        let is_complete = unit.starts_ns.len() == unit.frames as usize;
+        let starts_ns = if is_complete { unit.starts_ns.clone() } else { Vec::new() };
+        Self { setting, starts_ns, counts: Arc::new(counts) }
     }
 }
 

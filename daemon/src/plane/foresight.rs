@@ -89,7 +89,7 @@ impl Model {
         let percent = 100.0 * rates_hz.iter().map(share).fold(0.0, f64::max);
         let Some(key) = key else {
             return Some(format!(
-                "{lamp}, which the times of the frames should remove from all cycles of a film but the first {}: switch the lamp off",
+                "{lamp}, which the times of the frames should remove from all cycles of a film but the first {}: to keep these too, switch the lamp off",
                 FilmSolver::FIRST_CYCLES
             ));
         };

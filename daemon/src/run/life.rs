@@ -151,7 +151,7 @@ pub fn conduct(procedure: Box<dyn Measurement>, mut run: Run, points: usize) {
 
 /// The end of a run that could not reach its own, with the warnings from before it began: also recorded in the ledger, so
 /// that the session does not look as if it were still under way.
-fn failed(error: &RunError, points: usize, dir: &Path, mut warnings: Vec<String>) -> Ended {
+fn failed(error: &RunError, points: usize, dir: &Path, warnings: Vec<String>) -> Ended {
     let faulted = |stored, missing, warnings| EndEntry {
         error: Some(error.to_string()),
         ..EndEntry::new(EndState::Faulted, stored, missing, warnings)
@@ -159,10 +159,10 @@ fn failed(error: &RunError, points: usize, dir: &Path, mut warnings: Vec<String>
     let recorded = Session::open(dir).and_then(|session| freed(&session)).and_then(|mut ledger| {
         let state = ledger.state();
         // An end that was recorded before the report failed has warnings of its own.
-        let known = state.end.iter().flat_map(|end| &end.warnings).filter(|known| !warnings.contains(known));
-        let known: Vec<String> = known.cloned().collect();
-        warnings.extend(known);
-        let end = faulted(state.stored_points(), state.missing_points(), warnings.clone());
+        let known = state.end.as_ref().map_or_else(Vec::new, |end| end.warnings.clone());
+        let mut end = faulted(state.stored_points(), state.missing_points(), warnings.clone());
+        end.warnings.retain(|warning| !known.contains(warning));
+        end.warnings.extend(known);
         ledger.append(&Entry::End(end.clone())).map(|()| end)
     });
     let end = recorded.unwrap_or_else(|not_recorded| {

@@ -154,8 +154,13 @@ impl CameraSection {
                 let gains = features
                     .filter(|(name, _)| is_gain(name))
                     .map(|(name, value)| (format!("features {}", name.trim()), value.trim().to_owned()));
-                let all = region.into_iter().chain([binning]).chain(black_level).chain(gains);
-                all.map(|(key, value)| (format!("camera.aravis.{key}"), value)).collect()
+                let mut settings = BTreeMap::<String, String>::new();
+                for (key, value) in region.into_iter().chain([binning]).chain(black_level).chain(gains) {
+                    // A selector may stand between several values of one feature.
+                    let values = settings.entry(format!("camera.aravis.{key}")).or_default();
+                    *values = if values.is_empty() { value } else { format!("{values}, {value}") };
+                }
+                settings
             }
             CameraDriver::V4l2 => {
                 let controls = self.v4l2.iter().flat_map(|v4l2| &v4l2.controls);

@@ -1,16 +1,20 @@
 //! A lamp that flickers during a film: found in its first cycles, and removed from all cycles after them.
 
-use std::slice;
+use std::{iter, slice};
 
 use ndarray::{Array2, ArrayViewMut2};
 use raysweep_transport::plane::calibrate::{
     CalibrateError, CycleFlicker, FrameExposures, LampFlicker, Sample, Unexplained, can_be_followed,
 };
 
+use super::FilmSolver;
 use crate::flicker::{DARK_ROOM, RoomFindings, frame_rate_hz, say_removed};
 use crate::scale::LightScale;
 use crate::schedule::SweepGeometry;
 use crate::stack::SweepStack;
+
+/// Least share of an exposure for which a row of the dark image is taken to have seen the lamp.
+const LEAST_SEEN_SHARE: f64 = 0.1;
 
 /// The light of a film's room, as its dark image shows it.
 pub(super) struct FilmRoom<'a> {
@@ -49,8 +53,11 @@ impl<'a> FilmRoom<'a> {
     /// Its light at each pixel, of white per us: what the dark image shows of it over what that saw of the lamp.
     fn levels_per_us(&self, lamp: Option<&LampFlicker>) -> Array2<f32> {
         let mut levels = self.light.clone();
+        let exposure_us = self.frames.exposure_us;
         for (t, mut row) in levels.rows_mut().into_iter().enumerate() {
-            let seen_us = self.frames.exposure_us + lamp.map_or(0.0, |lamp| lamp.excess_us(&self.frames, t));
+            let seen_us = exposure_us + lamp.map_or(0.0, |lamp| lamp.excess_us(&self.frames, t));
+            // A row that was dark almost all the time does not tell its level.
+            let seen_us = seen_us.max(LEAST_SEEN_SHARE * exposure_us);
             row.mapv_inplace(|light| light / seen_us as f32);
         }
         levels
@@ -87,7 +94,10 @@ impl FilmLamp {
         let calibration = room.geometry.calibration.as_ref();
         let expected_hz = calibration.and_then(|calibration| calibration.lamp).map(|lamp| lamp.frequency_hz);
         let found = CycleFlicker::find(cycles, room.row_time_s(), expected_hz);
-        let Some((found, rate_hz)) = found.zip(frame_rate_hz(std::iter::once(&room.frames))) else {
+        let mut opened_s: Vec<f64> = frames.iter().flat_map(|frames| &frames.opened_s).copied().collect();
+        opened_s.sort_by(f64::total_cmp);
+        let all = FrameExposures { opened_s, ..room.frames };
+        let Some((found, rate_hz)) = found.zip(frame_rate_hz(iter::once(&all))) else {
             return (None, RoomFindings::default());
         };
         let CycleFlicker { frequency_hz, share } = found;
@@ -112,7 +122,8 @@ impl FilmLamp {
     }
 
     /// Removes it from the images of a cycle, or from their means over cycles; `frames` are those of each setting. Phase
-    /// and amplitude wander, so they are found in each cycle anew.
+    /// and amplitude wander, so they are found in each cycle anew; a cycle in which no lamp can be like that, because its
+    /// scene moves, stays as it is.
     pub fn remove(&self, room: &FilmRoom<'_>, frames: &[FrameExposures], stack: &mut SweepStack) {
         let Self(lamp) = self;
         let levels_per_us = room.levels_per_us(Some(lamp));
@@ -124,9 +135,12 @@ impl FilmLamp {
         let unexplained = room.unexplained_at(&levels_per_us, stack, frames);
         let of_cycle = unexplained
             .and_then(|cycle| LampFlicker::follow(&[cycle], (lamp.frequency_hz, room.row_time_s())));
-        let Ok(of_cycle) = of_cycle else { return };
+        let of_cycle = of_cycle.ok().filter(LampFlicker::is_possible);
         for (image, frames) in stack.images.outer_iter_mut().zip(frames) {
-            let less_us: Vec<f64> = rows.clone().map(|t| -of_cycle.excess_us(frames, t)).collect();
+            let less_us: Vec<f64> = match &of_cycle {
+                Some(lamp) => rows.clone().map(|t| -lamp.excess_us(frames, t)).collect(),
+                None => in_dark.iter().map(|us| -us).collect(),
+            };
             add(image, &levels_per_us, &less_us);
         }
     }
@@ -147,8 +161,11 @@ impl FilmLamp {
             }
         }
         let removed_us = (sum / f64::from(count.max(1))).sqrt();
-        let by = "the times of the frames, in each cycle anew";
-        say_removed(room.level(), 100.0 * lamp.share(), lamp.frequency_hz, by, removed_us)
+        let by = format!(
+            "the times of the frames, in each cycle after the first {} anew",
+            FilmSolver::FIRST_CYCLES
+        );
+        say_removed(room.level(), 100.0 * lamp.share(), lamp.frequency_hz, &by, removed_us)
     }
 }
 

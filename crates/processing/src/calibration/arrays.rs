@@ -59,7 +59,9 @@ impl CalibrationArrays {
             let moment = |power: i32| -> f32 {
                 shares.iter().zip(0_u8..).map(|(share, row)| share * f32::from(row).powi(power)).sum()
             };
-            (moment(2) - moment(1).powi(2)).max(1.0 / 12.0).sqrt()
+            let variance = moment(2) - moment(1).powi(2);
+            // Not `max`, which would take NaN for a row.
+            if variance < 1.0 / 12.0 { (1.0_f32 / 12.0).sqrt() } else { variance.sqrt() }
         };
         median(self.response.lanes(Axis(0)).into_iter().map(width))
     }

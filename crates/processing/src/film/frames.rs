@@ -64,6 +64,14 @@ impl<'a> StoredFrames<'a> {
             Ok(_) => return Err(format!("cycle {cycle} is damaged: its checksum differs from the ledger's")),
             Err(error) => return Err(format!("cycle {cycle} is damaged ({error})")),
         };
+        let settings = raw.len_of(Axis(0));
+        if entry.delays_us.len() != settings || ![0, settings].contains(&entry.starts_ns.len()) {
+            return Err(format!(
+                "cycle {cycle} is damaged: the ledger has {} delays and {} times of its {settings} frames",
+                entry.delays_us.len(),
+                entry.starts_ns.len()
+            ));
+        }
         let mut filled = Array2::from_elem(self.dark.counts.dim(), false);
         let starts_ns = entry.starts_ns.iter().map(|&start_ns| vec![start_ns]);
         let times = entry.delays_us.iter().zip(starts_ns.chain(iter::repeat(Vec::new())));

@@ -84,7 +84,7 @@ impl PatternProducts {
 
     /// What could not be made, and what makes the products worse than they look.
     pub fn warnings(&self) -> impl Iterator<Item = &String> {
-        self.problems.iter().chain(&self.shortcomings)
+        self.shortcomings.iter().chain(&self.problems)
     }
 
     /// Writes report and manifest.

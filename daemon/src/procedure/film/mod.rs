@@ -241,7 +241,9 @@ fn conclude(acquired: Acquired, run: &FilmRun, orders: &Orders) -> Result<Ended,
         );
     }
     let transports_missing = ledger.state().film.as_ref().map_or(0, |film| film.transports_missing);
-    warnings.extend(problems.iter().cloned().chain(shortcomings(ledger.state(), transports_missing)));
+    // Of very many warnings the first are kept.
+    warnings.extend(shortcomings(ledger.state(), transports_missing));
+    warnings.extend(problems.iter().cloned());
     let stored = ledger.state().stored_points();
     let end = EndEntry {
         error: fault.map(|fault| fault.to_string()),

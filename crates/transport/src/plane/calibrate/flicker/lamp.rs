@@ -94,7 +94,12 @@ impl LampFlicker {
     /// Whether the images show this lamp: it explains most of what the pixels of a row have in common beyond the scene's
     /// light. What has another phase in each image does not look like a lamp.
     pub fn is_seen(&self) -> bool {
-        self.explained >= LEAST_SEEN && self.share() <= MOST_SHARE
+        self.explained >= LEAST_SEEN && self.is_possible()
+    }
+
+    /// Whether light can flicker like that: it is never negative.
+    pub fn is_possible(&self) -> bool {
+        self.share() <= MOST_SHARE
     }
 }
 
