@@ -156,7 +156,9 @@ fn arv_camera_test_gets_lost_packets_back() {
     assert!(figure(&report, "n_resent_packets") > 0, "{report}");
     assert_eq!(figure(&report, "n_failures"), 0, "{report}");
     assert_eq!(figure(&report, "n_missing_packets"), 0, "{report}");
-    assert!(figure(&report, "n_completed_buffers") * 2 > truth.frames, "{truth:?} {report}");
+    // Late with its buffers, the tool skips frames, but takes their packets.
+    assert!(figure(&report, "n_completed_buffers") > 0, "{report}");
+    assert!(figure(&report, "n_received_packets") * 2 > truth.packets, "{truth:?} {report}");
 }
 
 /// Discovery is a broadcast, to which cameras of other tests would respond.
