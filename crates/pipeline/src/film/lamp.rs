@@ -94,10 +94,8 @@ impl FilmLamp {
         let calibration = room.geometry.calibration.as_ref();
         let expected_hz = calibration.and_then(|calibration| calibration.lamp).map(|lamp| lamp.frequency_hz);
         let found = CycleFlicker::find(cycles, room.row_time_s(), expected_hz);
-        let mut opened_s: Vec<f64> = frames.iter().flat_map(|frames| &frames.opened_s).copied().collect();
-        opened_s.sort_by(f64::total_cmp);
-        let all = FrameExposures { opened_s, ..room.frames };
-        let Some((found, rate_hz)) = found.zip(frame_rate_hz(iter::once(&all))) else {
+        // Those of the dark image have one trigger delay: they follow each other in the camera's pace.
+        let Some((found, rate_hz)) = found.zip(frame_rate_hz(iter::once(&room.frames))) else {
             return (None, RoomFindings::default());
         };
         let CycleFlicker { frequency_hz, share } = found;
