@@ -3,6 +3,7 @@
 use raysweep_core::Readout;
 use serde::Deserialize;
 
+use super::is_gain;
 use crate::document::{Fault, out_of_range};
 
 /// `[camera.aravis]`
@@ -111,6 +112,21 @@ impl AravisConfig {
     /// Whether frames wait for a trigger.
     pub fn is_triggered(&self) -> bool {
         self.trigger_source != "off"
+    }
+
+    /// Keys and values of what the table says of where on the sensor the pixels lie and of what they count.
+    pub(super) fn sensor_settings(&self) -> Vec<(String, String)> {
+        let Self { region, binning: [columns, rows], black_level, features, .. } = self;
+        let region = region.map(|SensorRegion { x, y, width, height }| {
+            ("region".to_owned(), format!("{width} x {height} from column {x} and row {y} on"))
+        });
+        let binning = ("binning".to_owned(), format!("{columns} x {rows}"));
+        let black_level = black_level.map(|level| ("black_level".to_owned(), level.to_string()));
+        let features = features.iter().filter_map(|feature| feature.split_once('='));
+        let gains = features
+            .filter(|(name, _)| is_gain(name))
+            .map(|(name, value)| (format!("features {}", name.trim()), value.trim().to_owned()));
+        region.into_iter().chain([binning]).chain(black_level).chain(gains).collect()
     }
 
     /// Faults that can be found without the camera.

@@ -58,6 +58,11 @@ impl AnyRigFile {
     }
 }
 
+/// Whether a camera's feature or control of this name sets what a pixel counts of light.
+fn is_gain(name: &str) -> bool {
+    name.to_ascii_lowercase().contains("gain")
+}
+
 /// Longer than a camera takes to start.
 pub(super) fn default_reopen_s() -> f64 {
     60.0

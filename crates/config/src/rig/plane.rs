@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use raysweep_core::{PixelFormat, Raster};
 use serde::Deserialize;
 
-use super::aravis::{AravisConfig, SensorRegion};
+use super::aravis::AravisConfig;
 use super::v4l2::V4l2Config;
 use super::vsync::{VsyncDriver, VsyncSection};
 use super::{
@@ -140,37 +140,20 @@ impl CameraSection {
     /// What the file says of where on the sensor the pixels lie and of what they count, as keys and values: a calibration
     /// holds for these pixels alone.
     pub fn sensor_settings(&self) -> BTreeMap<String, String> {
-        let is_gain = |name: &str| name.to_ascii_lowercase().contains("gain");
-        match self.driver {
-            CameraDriver::Aravis => {
-                let AravisConfig { region, binning: [columns, rows], black_level, features, .. } =
-                    &self.aravis;
-                let region = region.map(|SensorRegion { x, y, width, height }| {
-                    ("region".to_owned(), format!("{width} x {height} from column {x} and row {y} on"))
-                });
-                let binning = ("binning".to_owned(), format!("{columns} x {rows}"));
-                let black_level = black_level.map(|level| ("black_level".to_owned(), level.to_string()));
-                let features = features.iter().filter_map(|feature| feature.split_once('='));
-                let gains = features
-                    .filter(|(name, _)| is_gain(name))
-                    .map(|(name, value)| (format!("features {}", name.trim()), value.trim().to_owned()));
-                let mut settings = BTreeMap::<String, String>::new();
-                for (key, value) in region.into_iter().chain([binning]).chain(black_level).chain(gains) {
-                    // A selector may stand between several values of one feature.
-                    let values = settings.entry(format!("camera.aravis.{key}")).or_default();
-                    *values = if values.is_empty() { value } else { format!("{values}, {value}") };
-                }
-                settings
-            }
+        let (table, stated) = match self.driver {
+            CameraDriver::Aravis => ("aravis", self.aravis.sensor_settings()),
             CameraDriver::V4l2 => {
-                let controls = self.v4l2.iter().flat_map(|v4l2| &v4l2.controls);
-                controls
-                    .filter(|(name, _)| is_gain(name))
-                    .map(|(name, value)| (format!("camera.v4l2.controls {name}"), value.to_string()))
-                    .collect()
+                ("v4l2", self.v4l2.as_ref().map_or_else(Vec::new, V4l2Config::sensor_settings))
             }
-            CameraDriver::Sim => BTreeMap::new(),
+            CameraDriver::Sim => return BTreeMap::new(),
+        };
+        let mut settings = BTreeMap::<String, String>::new();
+        for (key, value) in stated {
+            // A selector may stand between several values of one feature.
+            let values = settings.entry(format!("camera.{table}.{key}")).or_default();
+            *values = if values.is_empty() { value } else { format!("{values}, {value}") };
         }
+        settings
     }
 }
 

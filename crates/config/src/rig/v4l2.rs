@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use raysweep_core::Readout;
 use serde::Deserialize;
 
+use super::is_gain;
 use crate::document::{Document, Fault, out_of_range};
 
 /// How to open and set a V4L2 camera. Controls are called by their names, as `v4l2-ctl --list-ctrls` spells them.
@@ -55,6 +56,12 @@ pub struct TimeControl {
 }
 
 impl V4l2Config {
+    /// Keys and values of what the table says of what pixels count.
+    pub(super) fn sensor_settings(&self) -> Vec<(String, String)> {
+        let gains = self.controls.iter().filter(|(name, _)| is_gain(name));
+        gains.map(|(name, value)| (format!("controls {name}"), value.to_string())).collect()
+    }
+
     /// Checks the table of a camera whose driver is `v4l2`.
     pub(super) fn check_section(section: Option<&Self>, document: &mut Document<'_>) {
         match section {
