@@ -3,7 +3,7 @@
 use raysweep_core::Readout;
 use serde::Deserialize;
 
-use super::is_gain;
+use super::sensor::is_gain;
 use crate::document::{Fault, out_of_range};
 
 /// `[camera.aravis]`

@@ -4,6 +4,7 @@ pub mod aravis;
 pub mod dots;
 pub mod plane;
 pub mod replay;
+mod sensor;
 pub mod v4l2;
 pub mod vsync;
 
@@ -56,11 +57,6 @@ impl AnyRigFile {
             None => document.finish(None),
         }
     }
-}
-
-/// Whether a camera's feature or control of this name sets what a pixel counts of light.
-fn is_gain(name: &str) -> bool {
-    name.to_ascii_lowercase().contains("gain")
 }
 
 /// Longer than a camera takes to start.

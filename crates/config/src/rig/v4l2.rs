@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use raysweep_core::Readout;
 use serde::Deserialize;
 
-use super::is_gain;
+use super::sensor::is_gain;
 use crate::document::{Document, Fault, out_of_range};
 
 /// How to open and set a V4L2 camera. Controls are called by their names, as `v4l2-ctl --list-ctrls` spells them.
