@@ -459,11 +459,13 @@ fn a_state_that_cannot_be_read_is_no_parked_mirror() {
             "{state}: {said}"
         );
     }
-    let (code, out, _) = park("/nonexistent/mirror.json", &[]);
-    assert!(
-        code == Some(1) && out.contains("/nonexistent/mirror.json does not exist: nothing was parked"),
-        "{out}"
-    );
+    for more in [&[] as &[&str], &["--when-closed"]] {
+        let (code, out, _) = park("/nonexistent/mirror.json", more);
+        assert!(
+            code == Some(1) && out.contains("/nonexistent/mirror.json does not exist: nothing was parked"),
+            "{more:?}: {out}"
+        );
+    }
     let (code, out, _) = park("/nonexistent/mirror.json", &["--json"]);
     assert_eq!((code, out.trim()), (Some(1), r#"{"parked":"nothing"}"#));
 }

@@ -162,14 +162,13 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
         }
         Command::Park { state, if_moved: true, .. } if matches!(state.try_exists(), Ok(false)) => {}
         Command::Park { state, when_closed, .. } => {
-            let is_there = state.exists();
             let parked = if when_closed {
                 mirror::park_when_closed(io::stdin(), &state)?
             } else {
                 mirror::park(&state)?
             };
             match parked {
-                Parked::Already if !is_there && !when_closed => {
+                Parked::Already if matches!(state.try_exists(), Ok(false)) => {
                     printer.print(&show::nothing_parked_name(), |_| show::nothing_parked(&state))?;
                     return Ok(Exit::Failed);
                 }
