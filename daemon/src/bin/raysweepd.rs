@@ -118,7 +118,7 @@ fn live_file(arguments: &DaemonArguments) -> Result<Option<LiveFile>, LiveError>
 /// Moves a mirror that an earlier daemon left off-centre to the origin, before anything else happens.
 fn park_left_behind(data: &Path) {
     match park(&mirror::state_file(data)) {
-        Ok(Parked::Already) => {}
+        Ok(Parked::Already | Parked::NeverMoved) => {}
         Ok(parked) => tracing::warn!(?parked, "parked a mirror that was left behind"),
         // Runs without a mirror can continue; the mirror's driver refuses to open until it is parked.
         Err(error) => tracing::error!(%error, "a mirror that was left behind is not parked"),

@@ -167,12 +167,9 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             } else {
                 mirror::park(&state)?
             };
-            match parked {
-                Parked::Already if matches!(state.try_exists(), Ok(false)) => {
-                    printer.print(&show::nothing_parked_name(), |_| show::nothing_parked(&state))?;
-                    return Ok(Exit::Failed);
-                }
-                parked => printer.print(&show::parked_name(parked), |_| show::parked(parked))?,
+            printer.print(&show::parked_name(parked), |_| show::parked(parked, &state))?;
+            if parked == Parked::NeverMoved {
+                return Ok(Exit::Failed);
             }
         }
         Command::Sessions(filter) => {

@@ -83,31 +83,23 @@ fn settings_latency(min_frames: u32, max_frames: u32) -> String {
     }
 }
 
-/// Result of `park` without a state file, for programs.
-pub(super) fn nothing_parked_name() -> serde_json::Value {
-    serde_json::json!({ "parked": "nothing" })
-}
-
-/// Text of `park` without a state file.
-pub(super) fn nothing_parked(state: &Path) -> String {
-    format!(
-        "{} does not exist: nothing was parked; give the file mirror.json in the daemon's data folder with --state",
-        state.display()
-    )
-}
-
 /// Result of `park`, for programs.
 pub(super) fn parked_name(parked: Parked) -> serde_json::Value {
     match parked {
+        Parked::NeverMoved => serde_json::json!({ "parked": "nothing" }),
         Parked::Already => serde_json::json!({ "parked": "already" }),
         Parked::From(tilt) => serde_json::json!({ "parked": "from", "tilt_deg": tilt.deg() }),
         Parked::ByReset => serde_json::json!({ "parked": "by_reset" }),
     }
 }
 
-/// Text of `park`.
-pub(super) fn parked(parked: Parked) -> String {
+/// Text of `park` with the state file `state`.
+pub(super) fn parked(parked: Parked, state: &Path) -> String {
     match parked {
+        Parked::NeverMoved => format!(
+            "{} does not exist: nothing was parked; give the file mirror.json in the daemon's data folder with --state",
+            state.display()
+        ),
         Parked::Already => "the mirror was already parked".into(),
         Parked::From(tilt) => {
             let [x, y] = tilt.deg();

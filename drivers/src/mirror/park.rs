@@ -28,7 +28,9 @@ pub enum ParkError {
 /// How a mirror was parked.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Parked {
-    /// It was parked already, or has never been moved.
+    /// There is no state: no driver that keeps it there has moved a mirror.
+    NeverMoved,
+    /// It was parked already.
     Already,
     /// It was found at this tilt and moved to the origin with the light off.
     From(Tilt),
@@ -45,14 +47,14 @@ pub enum Parked {
 pub fn park(state: &Path) -> Result<Parked, ParkError> {
     // If no mirror was ever moved, do not create files.
     if matches!(state.try_exists(), Ok(false)) {
-        return Ok(Parked::Already);
+        return Ok(Parked::NeverMoved);
     }
     park_left(&StateFile::open(state, LOCK_WAIT)?)
 }
 
 /// As [`park()`], with the lock already held.
 pub(super) fn park_left(file: &StateFile) -> Result<Parked, ParkError> {
-    let Some((state, sent)) = file.read()? else { return Ok(Parked::Already) };
+    let Some((state, sent)) = file.read()? else { return Ok(Parked::NeverMoved) };
     if state.playing.is_none() {
         return Ok(Parked::Already);
     }

@@ -401,5 +401,5 @@ fn a_state_of_another_boot_is_not_trusted() {
 #[test]
 fn nothing_to_park() {
     let folder = tempfile::tempdir().unwrap();
-    assert_eq!(park(&folder.path().join("mirror.json")).unwrap(), Parked::Already);
+    assert_eq!(park(&folder.path().join("mirror.json")).unwrap(), Parked::NeverMoved);
 }
