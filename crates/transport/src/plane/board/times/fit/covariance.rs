@@ -75,9 +75,8 @@ impl Fit<'_> {
         self.add_priors(&mut scatter, &mut right, free);
         let inverse = matrix.clone().cholesky().ok_or(TimesError::Undetermined)?.inverse();
         let mut covariance = &inverse * scatter * &inverse;
-        for (row, samples) in samples.iter().enumerate().filter(|(_, samples)| !samples.is_empty()) {
-            let score = cells.columns(row * groups, groups).column_sum();
-            let others = &matrix - information(samples, &jitters);
+        for samples in samples.iter().filter(|samples| !samples.is_empty()) {
+            let (others, score) = without(&matrix, &frames, samples);
             let change = others.cholesky().map_or_else(|| &inverse * &score, |others| others.solve(&score));
             covariance.ger(1.0, &change, &change, 1.0);
         }
@@ -148,20 +147,25 @@ impl Fit<'_> {
     }
 }
 
-/// The part of the normal matrix that comes from the samples of one camera row. `jitters`, `[unknown, frame]`, says how the
-/// jitter of each frame goes with the unknowns.
-fn information(samples: &[RowSample], jitters: &DMatrix<f64>) -> DMatrix<f64> {
-    let count = jitters.nrows();
-    let (mut matrix, mut right) = (DMatrix::zeros(count, count), DVector::zeros(count));
-    let mut mixed = DMatrix::zeros(count, samples.len());
-    let mut late = DMatrix::zeros(count, samples.len());
+/// The normal matrix without the samples of one camera row, and how far that row draws the others' normal equations:
+/// the jitters of its frames are found again without it, too, because few rows tell a frame with two borders its jitter.
+fn without(
+    matrix: &DMatrix<f64>,
+    frames: &[FrameNormal],
+    samples: &[RowSample],
+) -> (DMatrix<f64>, DVector<f64>) {
+    let count = matrix.nrows();
+    let (mut row, mut score) = (DMatrix::zeros(count, count), DVector::zeros(count));
+    let mut with = DMatrix::zeros(count, samples.len());
+    let mut without = DMatrix::zeros(count, samples.len());
     for (index, RowSample { frame, edges, sums }) in samples.iter().enumerate() {
         let mut own = FrameNormal { frame: *frame, mixed: DVector::zeros(count), weight: 0.0, right: 0.0 };
-        own.add(edges, sums, &mut matrix, &mut right);
-        let jitter = jitters.column(*frame);
-        mixed.set_column(index, &(jitter * (own.weight / 2.0) - own.mixed));
-        late.set_column(index, &jitter);
+        own.add(edges, sums, &mut row, &mut score);
+        let FrameNormal { mixed, weight, .. } = &frames[*frame];
+        let (others_mixed, others_weight) = (mixed - &own.mixed, weight - own.weight);
+        score.axpy(-own.right / others_weight, &others_mixed, 1.0);
+        with.set_column(index, &(mixed / weight.sqrt()));
+        without.set_column(index, &(others_mixed / others_weight.sqrt()));
     }
-    let with_jitter = mixed * late.transpose();
-    matrix + &with_jitter + with_jitter.transpose()
+    (matrix - row + &with * with.transpose() - &without * without.transpose(), score)
 }
