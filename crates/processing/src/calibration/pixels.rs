@@ -156,7 +156,8 @@ impl BoardPixels {
         let rows =
             RowPictures::of(images, WhichBoard::First, &black, |frames| curve.straightened(frames, &dark))?;
         let (places, responses) = rows.responses(images.task, &white)?;
-        let columns = Columns::new(responses.place.view(), responses.response.view(), None)?;
+        let columns = Columns::new(responses.place.view(), responses.response.view(), None)?
+            .with_errors_of(&responses)?;
         Ok(Self {
             dark,
             transfer,
@@ -301,8 +302,7 @@ impl BoardPixels {
             other => return Ok((other?, None)),
         };
         let Some(columns) = self.projector_columns(images)? else { return Err(uneven.into()) };
-        let pixels = (self.responses.place.view(), self.responses.response.view());
-        match RowTimes::find_spot(pixels, columns.view(), &frames, &nominal, share)? {
+        match RowTimes::find_spot(&self.responses, columns.view(), &frames, &nominal, share)? {
             Some((times, spot)) => Ok((times, Some(spot))),
             None => Err(uneven.into()),
         }

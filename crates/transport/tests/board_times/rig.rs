@@ -1,11 +1,12 @@
 //! A projector, a white board and a camera, simulated pixel by pixel: each drawn row sends its light evenly over its
 //! dwell, and the camera counts electrons. It shares no code with the estimator.
 
-use ndarray::{Array2, Array3};
+use ndarray::{Array2, Array3, ArrayView2, s};
 use rand_distr::{Distribution, Normal, Uniform};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use rand_xoshiro::rand_core::SeedableRng;
 use raysweep_transport::plane::NoiseModel;
+use raysweep_transport::plane::board::images::{ResponseChecks, Responses};
 use raysweep_transport::plane::board::times::{BoardSetting, ExposureMode, Nominal};
 
 pub const WHITE_DN: f64 = 2500.0;
@@ -75,7 +76,7 @@ impl Case {
             global_delay_acts: true,
             slopes: [0.0, 0.0],
             unevenness: 0.01,
-            response_error: 0.001,
+            response_error: 0.0002,
         }
     }
 
@@ -96,8 +97,7 @@ pub struct Rig {
     white_dn: Array2<f64>,
     /// White as it has been measured.
     white_map_dn: Array2<f64>,
-    pub place: Array2<f32>,
-    pub response: Array3<f32>,
+    pub responses: Responses,
     random: Xoshiro256PlusPlus,
     pub jitters_us: Vec<f64>,
 }
@@ -150,42 +150,19 @@ impl Rig {
             let centre = centres[[t, s]] - (BEAM_BELOW - BEAM_ABOVE) / 2.0;
             if lit(t, s) { centre as f32 } else { f32::NAN }
         });
-        // A response is measured over 21 rows: 0.4 % in all, the same for neighbours in a column.
-        let errors: Vec<[f64; 16]> = (0..(rows / 21 + 1) * case.columns)
-            .map(|_| {
-                std::array::from_fn(|d| {
-                    if (3..12).contains(&d) { case.response_error * unit.sample(&mut random) } else { 0.0 }
-                })
-            })
-            .collect();
-        let mut response = Array3::zeros((16, rows, case.columns));
+        let pictures = PictureNoise { share: case.response_error, common: case.response_error / 2.0 };
+        let errors = pictures.errors(shape, &mut random);
+        let mut responses = pictures.unmeasured(&place);
         for ((t, s), &place) in place.indexed_iter().filter(|(_, place)| place.is_finite()) {
             let mut shares = [0.0; 16];
             for (v, share) in seen_rows(centres[[t, s]]) {
                 shares[(v as i64 - place.round() as i64 + 7) as usize] += share;
             }
-            shares
-                .iter_mut()
-                .zip(errors[t / 21 * case.columns + s])
-                .for_each(|(share, error)| *share += error);
-            let sum: f64 = shares.iter().sum();
-            for d in 0..16 {
-                response[[d, t, s]] = (shares[d] / sum) as f32;
-            }
+            shares.iter_mut().zip(errors.slice(s![.., t, s])).for_each(|(share, error)| *share += error);
+            set_response(&mut responses, (t, s), &shares);
         }
         let jitters_us = Vec::new();
-        Self {
-            case,
-            starts_us,
-            centres,
-            brightness,
-            white_dn,
-            white_map_dn,
-            place,
-            response,
-            random,
-            jitters_us,
-        }
+        Self { case, starts_us, centres, brightness, white_dn, white_map_dn, responses, random, jitters_us }
     }
 
     /// What is known before the calibration: no latency, an even sweep, a row time 0.2 % off.
@@ -276,6 +253,79 @@ impl Rig {
 
     pub fn case(&self) -> &Case {
         &self.case
+    }
+}
+
+/// Noise of the pictures from which responses are made. Each is averaged over 21 rows and 9 columns, so that neighbours err
+/// alike, and the black one is subtracted from all.
+pub struct PictureNoise {
+    /// Standard deviation of each share.
+    pub share: f64,
+    /// Standard deviation of what all shares have in common.
+    pub common: f64,
+}
+
+impl PictureNoise {
+    /// Errors of the shares that are seen, `[16, t, s]`.
+    fn errors(&self, shape: (usize, usize), random: &mut Xoshiro256PlusPlus) -> Array3<f64> {
+        let unit = Normal::new(0.0, 1.0).unwrap();
+        let mut averaged = |sd: f64| {
+            let picture = Array2::from_shape_fn(shape, |_| 189.0_f64.sqrt() * sd * unit.sample(random));
+            Array2::from_shape_fn(shape, |(t, s)| near(&picture, (t, s)).mean().unwrap())
+        };
+        let black = averaged(self.common);
+        let mut errors = Array3::zeros((16, shape.0, shape.1));
+        for mut errors in errors.outer_iter_mut() {
+            errors.assign(&(averaged(self.share) - &black));
+        }
+        errors
+    }
+
+    /// Responses at these places that state these errors, and have no shares yet.
+    fn unmeasured(&self, place: &Array2<f32>) -> Responses {
+        let shape = place.dim();
+        let sd = |sd: f64| {
+            Array2::from_shape_fn(shape, |at| (sd * (189.0 / near(place, at).len() as f64).sqrt()) as f32)
+        };
+        let share_sd = sd(self.share.hypot(self.common));
+        Responses {
+            place: place.clone(),
+            place_sd: Array2::zeros(shape),
+            response: Array3::zeros((16, shape.0, shape.1)),
+            response_sd: share_sd.broadcast((16, shape.0, shape.1)).unwrap().to_owned(),
+            common_sd: sd(self.common),
+            checks: ResponseChecks {
+                sum_of_phases: 1.0,
+                two_peaks: 0.0,
+                far_light: 0.0,
+                place_rms_rows: 0.0,
+            },
+        }
+    }
+
+    /// Other pictures of the same board.
+    pub fn measured_again(&self, responses: &Responses, seed: u64) -> Responses {
+        let errors = self.errors(responses.place.dim(), &mut Xoshiro256PlusPlus::seed_from_u64(seed));
+        let mut again = self.unmeasured(&responses.place);
+        for (at, _) in responses.place.indexed_iter().filter(|(_, place)| place.is_finite()) {
+            let shares = responses.response.slice(s![.., at.0, at.1]).mapv(f64::from)
+                + errors.slice(s![.., at.0, at.1]);
+            set_response(&mut again, at, shares.as_slice().unwrap());
+        }
+        again
+    }
+}
+
+/// The pixels over which a response is averaged.
+fn near<T>(image: &Array2<T>, (t, s): (usize, usize)) -> ArrayView2<'_, T> {
+    let (rows, columns) = image.dim();
+    image.slice(s![t.saturating_sub(10)..(t + 11).min(rows), s.saturating_sub(4)..(s + 5).min(columns)])
+}
+
+fn set_response(responses: &mut Responses, (t, s): (usize, usize), shares: &[f64]) {
+    let sum: f64 = shares.iter().sum();
+    for (d, share) in shares.iter().enumerate() {
+        responses.response[[d, t, s]] = (share / sum) as f32;
     }
 }
 

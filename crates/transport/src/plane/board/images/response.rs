@@ -15,9 +15,9 @@ const ROWS: RangeInclusive<i32> = FIRST_RESPONSE_ROW..=FIRST_RESPONSE_ROW + RESP
 /// A pixel's own row is at this index of its response.
 const OWN: i32 = -FIRST_RESPONSE_ROW;
 /// Counts are averaged over this many camera rows above and below.
-const REACH_ROWS: usize = 10;
+pub(in super::super) const REACH_ROWS: usize = 10;
 /// Counts are averaged over at most this many columns to the left and right.
-const REACH_COLUMNS: usize = 4;
+pub(in super::super) const REACH_COLUMNS: usize = 4;
 /// Pixels are averaged whose places differ by whole rows to within this.
 const MOST_SHIFT_ROWS: f32 = 0.05;
 /// The sum of the pictures may differ from white by this share.
@@ -46,6 +46,9 @@ pub struct Responses {
     pub response: Array3<f32>,
     /// Its standard deviation, `[16, t, s]`.
     pub response_sd: Array3<f32>,
+    /// The part of it that all shares of a pixel have in common, because the same black picture was subtracted from all
+    /// pictures, `[t, s]`.
+    pub common_sd: Array2<f32>,
     /// What the images say about projector and board.
     pub checks: ResponseChecks,
 }
@@ -133,27 +136,31 @@ impl Responses {
         check_frames(phases.frames, 1)?;
         check_shape("phases", "[pictures, t, s]", phases.images.shape(), &[PHASES, rows, columns])?;
         check_shape("white_dn", "[t, s]", white.white_dn.shape(), &[rows, columns])?;
-        let window = Window { light: by_pixel(phases), place: &places.place, projector_rows };
+        let black_sd_dn = white.black_sd_dn;
+        let window = Window { light: by_pixel(phases), place: &places.place, black_sd_dn, projector_rows };
         let mut place = Array2::from_elem(shape, f32::NAN);
-        let mut place_sd = place.clone();
+        let (mut place_sd, mut common_sd) = (place.clone(), place.clone());
         let mut response = Array3::from_elem((PHASES, rows, columns), f32::NAN);
         let mut response_sd = response.clone();
         place
             .axis_iter_mut(Axis(0))
             .into_par_iter()
-            .zip(place_sd.axis_iter_mut(Axis(0)))
+            .zip(place_sd.axis_iter_mut(Axis(0)).into_par_iter().zip(common_sd.axis_iter_mut(Axis(0))))
             .zip(response.axis_iter_mut(Axis(1)).into_par_iter().zip(response_sd.axis_iter_mut(Axis(1))))
             .enumerate()
-            .for_each(|(t, ((mut place, mut place_sd), (mut response, mut response_sd)))| {
-                for s in 0..columns {
-                    if let Some(pixel) = window.pixel(t, s) {
-                        place[s] = pixel.place;
-                        place_sd[s] = pixel.place_sd;
-                        response.column_mut(s).assign(&ArrayView1::from(&pixel.response));
-                        response_sd.column_mut(s).assign(&ArrayView1::from(&pixel.response_sd));
+            .for_each(
+                |(t, ((mut place, (mut place_sd, mut common_sd)), (mut response, mut response_sd)))| {
+                    for s in 0..columns {
+                        if let Some(pixel) = window.pixel(t, s) {
+                            place[s] = pixel.place;
+                            place_sd[s] = pixel.place_sd;
+                            common_sd[s] = pixel.common_sd;
+                            response.column_mut(s).assign(&ArrayView1::from(&pixel.response));
+                            response_sd.column_mut(s).assign(&ArrayView1::from(&pixel.response_sd));
+                        }
                     }
-                }
-            });
+                },
+            );
         if place.iter().all(|place| place.is_nan()) {
             let what = "lit pixels with lit neighbours";
             let cure = "fill the view with the board";
@@ -164,7 +171,7 @@ impl Responses {
             place_rms_rows: places.rms,
             ..checks(&response)
         };
-        Ok(Self { place, place_sd, response, response_sd, checks })
+        Ok(Self { place, place_sd, response, response_sd, common_sd, checks })
     }
 
     /// Standard deviation of the width of a response relative to itself: the median over the lit pixels. The shares are
@@ -225,6 +232,7 @@ struct Window<'a> {
     /// `[t, s, 16]`.
     light: Array3<f32>,
     place: &'a Array2<f32>,
+    black_sd_dn: f64,
     projector_rows: usize,
 }
 
@@ -233,6 +241,7 @@ struct Pixel {
     place_sd: f32,
     response: [f32; PHASES],
     response_sd: [f32; PHASES],
+    common_sd: f32,
 }
 
 /// Mean counts of one camera row's pixels, by relative row.
@@ -358,6 +367,8 @@ impl Window<'_> {
             place_sd: (factor * centroid_square.sqrt()) as f32,
             response: response.map(|share| (share / kept) as f32),
             response_sd: turned(&squares).map(|square| (factor * square.sqrt() / kept) as f32),
+            common_sd: (self.black_sd_dn / means.iter().map(|row| row.pixels).sum::<f64>().sqrt() / total)
+                as f32,
         })
     }
 }
@@ -573,8 +584,8 @@ mod tests {
             });
         let checks =
             ResponseChecks { sum_of_phases: 1.0, two_peaks: 0.0, far_light: 0.0, place_rms_rows: 0.0 };
-        let (place_sd, response_sd) = (place.clone(), response.clone());
-        let responses = Responses { place, place_sd, response, response_sd, checks };
+        let (place_sd, common_sd, response_sd) = (place.clone(), place.clone(), response.clone());
+        let responses = Responses { place, place_sd, response, response_sd, common_sd, checks };
         let filled = responses.pixel_response().unwrap();
         assert_eq!(filled.places().as_slice().unwrap(), [10.2, 10.3, 10.3, 11.2, 11.3, 11.3]);
         assert_eq!(filled.shares()[[8, 0, 2]], 1.0);

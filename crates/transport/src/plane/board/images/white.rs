@@ -12,6 +12,8 @@ pub struct WhiteMap {
     pub white_dn: Array2<f32>,
     /// Its standard deviation by the noise of the frames, `[t, s]`.
     pub sd_dn: Array2<f32>,
+    /// Standard deviation of a pixel of the black picture by the noise of its frames.
+    pub black_sd_dn: f64,
     /// Median over the lit pixels; the standard deviation contains the changes of all pixels from frame to frame.
     pub level_dn: Estimate,
     /// Share of the pixels that are lit.
@@ -45,10 +47,9 @@ impl WhiteMap {
         check_shape("black", "[t, s]", &black.shape()[1..], &white.shape()[1..])?;
         let black_dn = mean_image(black);
         let white_dn = mean_image(white) - &black_dn;
+        let black_variance_dn2 = noise.variance_dn2(0.0) / black_frames as f64;
         let sd_dn = white_dn.mapv(|white| {
-            let variance = noise.variance_dn2(f64::from(white)) / frames as f64
-                + noise.variance_dn2(0.0) / black_frames as f64;
-            variance.sqrt() as f32
+            (noise.variance_dn2(f64::from(white)) / frames as f64 + black_variance_dn2).sqrt() as f32
         });
         let lit = lit(&white_dn);
         let mut values: Vec<f64> =
@@ -63,6 +64,7 @@ impl WhiteMap {
             saturated: share(&saturated),
             white_dn,
             sd_dn,
+            black_sd_dn: black_variance_dn2.sqrt(),
         })
     }
 

@@ -5,12 +5,17 @@ use ndarray::{Array2, ArrayView1, ArrayView2, ArrayView3, s};
 use super::super::super::PlaneError;
 use super::super::super::error::check_shape;
 use super::super::super::model::{FIRST_RESPONSE_ROW, FlyingSpot, RESPONSE_ROWS, Scan};
+use super::super::images::{REACH_COLUMNS, Responses};
 
 /// Largest number of groups into which the columns of the image are averaged. More groups hardly help: they differ
 /// only in the fraction of a row at which their pixels lie.
 const GROUPS: usize = 12;
 /// Least part of the projector's width that a group of columns is taken to see: a spot is not a point.
 const LEAST_WIDTH: f64 = 1.0 / 32.0;
+
+/// The pictures from which a response is made: one for each of its rows, and the black one, which is subtracted from all.
+pub(super) const PICTURES: usize = RESPONSE_ROWS + 1;
+const BLACK: usize = RESPONSE_ROWS;
 
 /// What each camera row sees of each drawn row, averaged over groups of neighbouring columns.
 ///
@@ -27,6 +32,8 @@ pub struct Columns {
     cumulative: Array2<f64>,
     /// The fraction of each row's dwell that has passed when half of its light has been sent, of the same shape.
     middles: Array2<f64>,
+    /// Mean variance of a cell's pixels by the noise of each picture, `[row * groups + group, 17]`.
+    picture_variances: Array2<f64>,
     /// For each camera row, the drawn rows that any of its cells sees.
     reach: Vec<(f64, f64)>,
 }
@@ -62,7 +69,8 @@ pub(super) struct LightSent {
 impl Columns {
     /// From each pixel's `place` in projector rows, NaN where it is unlit, and its `response` `[16, t, s]`:
     /// the share of its light that drawn row `round(place) + d` sends, for `d` from -7 to 8. Rows are lit evenly, or by
-    /// a spot, whose columns are those of the lit pixels.
+    /// a spot, whose columns are those of the lit pixels. The responses have no errors, unless
+    /// [`Self::with_errors_of`] says so.
     ///
     /// # Errors
     /// [`PlaneError::Shape`] if the arrays do not fit together; [`PlaneError::OutOfRange`] for a response of a lit
@@ -163,7 +171,39 @@ impl Columns {
                 *end = end.max(row as f64 + 1.0);
             }
         }
-        Ok(Self { lit, groups, cells, cumulative, middles, reach })
+        Ok(Self {
+            picture_variances: Array2::zeros((cells.len(), PICTURES)),
+            lit,
+            groups,
+            cells,
+            cumulative,
+            middles,
+            reach,
+        })
+    }
+
+    /// The same with the errors of these responses.
+    ///
+    /// # Errors
+    /// [`PlaneError::Shape`] if they have another shape.
+    pub fn with_errors_of(mut self, responses: &Responses) -> Result<Self, PlaneError> {
+        let Responses { response_sd, common_sd, .. } = responses;
+        let (rows, columns) = self.lit.dim();
+        check_shape("response_sd", "[16, t, s]", response_sd.shape(), &[RESPONSE_ROWS, rows, columns])?;
+        check_shape("common_sd", "[t, s]", common_sd.shape(), &[rows, columns])?;
+        let count = self.groups.len();
+        for (index, cell) in self.cells.iter().enumerate() {
+            let (row, mut variances) = (index / count, self.picture_variances.row_mut(index));
+            for column in self.groups[index % count].clone().filter(|&column| self.lit[[row, column]]) {
+                let variance = |sd: f32| f64::from(sd).powi(2) / cell.pixels as f64;
+                let common = variance(common_sd[[row, column]]);
+                variances[BLACK] += common;
+                for (own, &sd) in variances.iter_mut().zip(response_sd.slice(s![.., row, column])) {
+                    *own += (variance(sd) - common).max(0.0);
+                }
+            }
+        }
+        Ok(self)
     }
 
     /// The same under a spot that takes this part of a row's time, or more, to pass a group of columns; `None` if rows are
@@ -260,8 +300,7 @@ impl Columns {
             return steady(cumulative[cell.rows]);
         }
         let share = cumulative[whole + 1] - cumulative[whole];
-        let before_middle = from_first - whole as f64 - self.middles[[index, whole]];
-        match before_middle / cell.dwell + 0.5 {
+        match self.part_sent(index, whole, from_first) {
             ..=0.0 => steady(cumulative[whole]),
             1.0.. => steady(cumulative[whole + 1]),
             part => LightSent {
@@ -270,6 +309,42 @@ impl Columns {
                 sd: share * cell.step_sd,
             },
         }
+    }
+}
+
+impl Columns {
+    /// The part of its light that a drawn row, of index `row` in the cell's response, has sent; below 0 before it begins,
+    /// beyond 1 after its end.
+    #[inline]
+    fn part_sent(&self, index: usize, row: usize, from_first: f64) -> f64 {
+        (from_first - row as f64 - self.middles[[index, row]]) / self.cells[index].dwell + 0.5
+    }
+
+    /// What the light of a cell would have more, when `drawn` rows (with a fraction) have been drawn, if one of the
+    /// [`PICTURES`] of its response were brighter by all of the cell's light. The sum of its shares stays 1.
+    pub(super) fn error_before(&self, row: usize, group: usize, picture: usize, drawn: f64) -> f64 {
+        let index = row * self.groups.len() + group;
+        let cell = &self.cells[index];
+        let first = cell.place.round() as i64 + i64::from(FIRST_RESPONSE_ROW) - cell.first_row;
+        let part = |relative: usize| match usize::try_from(first + relative as i64) {
+            Ok(drawn_row) if drawn_row < cell.rows => {
+                self.part_sent(index, drawn_row, drawn - cell.first_row as f64).clamp(0.0, 1.0)
+            }
+            _ => 0.0,
+        };
+        let sent = self.light_before(row, group, drawn).sent;
+        match picture {
+            BLACK => RESPONSE_ROWS as f64 * sent - (0..RESPONSE_ROWS).map(part).sum::<f64>(),
+            _ => part(picture) - sent,
+        }
+    }
+
+    /// Variance of the mean of a cell's pixels in one of the [`PICTURES`], in squares of the cell's light, if each response
+    /// is an average over `averaged` camera rows.
+    pub(super) fn picture_variance(&self, row: usize, group: usize, picture: usize, averaged: usize) -> f64 {
+        let index = row * self.groups.len() + group;
+        let pixels = averaged * (2 * REACH_COLUMNS + 1);
+        self.picture_variances[[index, picture]] * pixels as f64 / self.cells[index].pixels.max(1) as f64
     }
 }
 

@@ -58,6 +58,9 @@ pub(super) struct Sums {
     pub closing_square: f64,
     pub opening_residual: f64,
     pub closing_residual: f64,
+    /// What residuals of 1 would add to those.
+    pub opening: f64,
+    pub closing: f64,
 }
 
 /// Which samples of a frame are compared.
@@ -71,7 +74,7 @@ pub(super) enum BoardSamples {
 
 impl ExposureEdge {
     /// Rows drawn, with the fraction.
-    fn drawn(&self) -> f64 {
+    pub fn drawn(&self) -> f64 {
         self.row as f64 + self.fraction
     }
 }
@@ -229,6 +232,8 @@ impl FrameComparison<'_> {
             sums.closing_square += weight * b * b;
             sums.opening_residual += weight * a * residual;
             sums.closing_residual += weight * b * residual;
+            sums.opening += weight * a;
+            sums.closing += weight * b;
         }
         sums
     }

@@ -2,12 +2,12 @@
 
 use nalgebra::{DMatrix, DVector};
 
+use super::super::super::images::REACH_ROWS;
+use super::super::columns::PICTURES;
 use super::super::error::TimesError;
 use super::super::model::{BoardSamples, Sums};
 use super::{Fit, FrameNormal, Normal, Sparse};
 
-/// Camera rows whose responses have errors in common, because they are averaged over as many.
-const BLOCK_ROWS: usize = 21;
 /// Share of the variance beside offset and slope that the modes may leave unexplained.
 const MODES_REST: f64 = 0.01;
 /// How much more a sweep may bend beyond the rows seen: the time by which it is early in its middle, as a share of it.
@@ -18,7 +18,44 @@ struct RowSample {
     /// Index among the frames used.
     frame: usize,
     edges: [Sparse; 2],
+    /// The rows drawn by the opening and by the closing edge.
+    drawn: [f64; 2],
     sums: Sums,
+    /// Those of each group of columns.
+    groups: Vec<Sums>,
+}
+
+/// The samples of all camera rows, and how the jitter of each frame goes with the unknowns, `[unknown, frame]`.
+struct Samples {
+    rows: Vec<Vec<RowSample>>,
+    jitters: DMatrix<f64>,
+}
+
+impl Samples {
+    /// What each cell adds to the right side of the normal equations, `[unknown, row * groups + group]`, if its samples
+    /// have these residuals, opening and closing.
+    fn scores(
+        &self,
+        groups: usize,
+        residuals: impl Fn((usize, usize), &RowSample) -> [f64; 2],
+    ) -> DMatrix<f64> {
+        let (unknowns, frames) = self.jitters.shape();
+        let mut scores = DMatrix::zeros(unknowns, self.rows.len() * groups);
+        let mut by_jitter = DMatrix::zeros(frames, self.rows.len() * groups);
+        for (row, samples) in self.rows.iter().enumerate() {
+            for (sample, group) in
+                samples.iter().flat_map(|sample| (0..groups).map(move |group| (sample, group)))
+            {
+                let cell = row * groups + group;
+                let [opening, closing] = residuals((row, group), sample);
+                for (edge, residual) in sample.edges.iter().zip([-opening, closing]) {
+                    edge.entries().iter().for_each(|&(a, x)| scores[(a, cell)] += residual * x);
+                    by_jitter[(sample.frame, cell)] -= residual;
+                }
+            }
+        }
+        scores - &self.jitters * by_jitter
+    }
 }
 
 impl Fit<'_> {
@@ -26,65 +63,78 @@ impl Fit<'_> {
     ///
     /// Residuals are not independent: the brightness of a drawn row is wrong in all columns and all frames, and the
     /// response of a few columns over many rows. The inverse of the normal matrix alone would be several times too
-    /// small. So the scatter of the scores is summed over camera rows, and over blocks of rows in a group of columns,
-    /// and what both contain is subtracted (clustered in two ways). Jitters and priors are independent and enter as
-    /// they are. A camera row draws the table towards its own error, the more the nearer it is to an end, so its scores
-    /// are those at the unknowns that the other rows give (the jackknife: CR3 of Bell and McCaffrey 2002).
+    /// small. So the scatter of the scores is that of whole camera rows, and what is known of the errors of responses is
+    /// added: residuals do not show them, because the table gives way to them. Jitters and priors are independent and
+    /// enter as they are. A camera row draws the table towards its own error, the more the nearer it is to an end, so
+    /// its scores are those at the unknowns that the other rows give (the jackknife: CR3 of Bell and McCaffrey 2002).
     pub(super) fn covariance(&self, free: bool) -> Result<DMatrix<f64>, TimesError> {
         let Normal { matrix, frames, .. } = self.normal(free);
         let count = self.unknowns.len();
-        let (rows, groups) = (self.columns.rows(), self.columns.groups());
+        let samples = self.samples(&frames);
+        let mut scatter = self.scatter_of_responses(&samples);
+        scatter += &samples.jitters * samples.jitters.transpose() * self.jitter_prior_us.powi(-2);
+        let mut right = DVector::zeros(count);
+        self.add_priors(&mut scatter, &mut right, free);
+        let inverse = matrix.clone().cholesky().ok_or(TimesError::Undetermined)?.inverse();
+        let mut covariance = &inverse * scatter * &inverse;
+        for samples in samples.rows.iter().filter(|samples| !samples.is_empty()) {
+            let (others, score) = without(&matrix, &frames, samples);
+            let change = others.cholesky().map_or_else(|| &inverse * &score, |others| others.solve(&score));
+            covariance.ger(1.0, &change, &change, 1.0);
+        }
+        Ok((&covariance + covariance.transpose()) / 2.0)
+    }
+
+    fn samples(&self, frames: &[FrameNormal]) -> Samples {
+        let groups = self.columns.groups();
         let sweep = self.sweep();
         let comparison = self.comparison(&sweep);
-        let mut cells = DMatrix::zeros(count, rows * groups);
-        let mut by_jitter = DMatrix::zeros(frames.len(), rows * groups);
-        let mut jitters = DMatrix::zeros(count, frames.len());
-        let mut samples: Vec<Vec<RowSample>> = (0..rows).map(|_| Vec::new()).collect();
+        let mut jitters = DMatrix::zeros(self.unknowns.len(), frames.len());
+        let mut rows: Vec<Vec<RowSample>> = (0..self.columns.rows()).map(|_| Vec::new()).collect();
         for (index, own) in frames.iter().enumerate() {
             let frame = &self.frames[own.frame];
             let late = (self.late_us[own.frame], self.longer_us(own.frame));
             jitters.set_column(index, &(&own.mixed / own.weight));
             comparison.visit(frame, late, BoardSamples::OnEdges, |row, opening, closing, sums| {
-                let edges = self.edges(own.frame, row, opening, closing);
-                for group in 0..groups {
-                    let cell = row * groups + group;
-                    let sums = comparison.compare(frame, row, group..group + 1, (opening, closing), false);
-                    let residuals = [-sums.opening_residual, sums.closing_residual];
-                    for (edge, residual) in edges.iter().zip(residuals) {
-                        edge.entries().iter().for_each(|&(a, x)| cells[(a, cell)] += residual * x);
-                        by_jitter[(index, cell)] -= residual;
-                    }
-                }
-                samples[row].push(RowSample { frame: index, edges, sums: *sums });
+                let of_group =
+                    |group| comparison.compare(frame, row, group..group + 1, (opening, closing), false);
+                rows[row].push(RowSample {
+                    frame: index,
+                    edges: self.edges(own.frame, row, opening, closing),
+                    drawn: [opening.drawn(), closing.drawn()],
+                    sums: *sums,
+                    groups: (0..groups).map(of_group).collect(),
+                });
             });
         }
-        cells -= &jitters * by_jitter;
-        let summed = |clusters: usize, cluster: &dyn Fn(usize, usize) -> usize| {
-            let mut sums = DMatrix::zeros(count, clusters);
+        Samples { rows, jitters }
+    }
+
+    /// The scatter of the scores that comes from the noise of the pictures of rows, from which each response is averaged
+    /// over the camera rows near it.
+    fn scatter_of_responses(&self, samples: &Samples) -> DMatrix<f64> {
+        let (rows, groups) = (self.columns.rows(), self.columns.groups());
+        let near = |row: usize| row.saturating_sub(REACH_ROWS)..(row + REACH_ROWS + 1).min(rows);
+        let mut scatter = DMatrix::zeros(self.unknowns.len(), self.unknowns.len());
+        for picture in 0..PICTURES {
+            let by_share = samples.scores(groups, |(row, group), sample| {
+                let [before, until] =
+                    sample.drawn.map(|drawn| self.columns.error_before(row, group, picture, drawn));
+                let Sums { opening, closing, .. } = sample.groups[group];
+                [opening * (before - until), closing * (before - until)]
+            });
+            let mut by_picture = DMatrix::zeros(self.unknowns.len(), rows * groups);
             for (row, group) in (0..rows).flat_map(|row| (0..groups).map(move |group| (row, group))) {
-                let mut sum = sums.column_mut(cluster(row, group));
-                sum += cells.column(row * groups + group);
+                let mut sum = by_picture.column_mut(row * groups + group);
+                for averaged in near(row) {
+                    let share = 1.0 / near(averaged).len() as f64;
+                    sum.axpy(share, &by_share.column(averaged * groups + group), 1.0);
+                }
+                sum *= self.columns.picture_variance(row, group, picture, near(row).len()).sqrt();
             }
-            &sums * sums.transpose()
-        };
-        let blocks = rows.div_ceil(BLOCK_ROWS);
-        let by_block = summed(blocks * groups, &|row, group| row / BLOCK_ROWS * groups + group);
-        let mut scatter = by_block - &cells * cells.transpose();
-        scatter += &jitters * jitters.transpose() * self.jitter_prior_us.powi(-2);
-        let mut right = DVector::zeros(count);
-        self.add_priors(&mut scatter, &mut right, free);
-        let inverse = matrix.clone().cholesky().ok_or(TimesError::Undetermined)?.inverse();
-        let mut covariance = &inverse * scatter * &inverse;
-        for samples in samples.iter().filter(|samples| !samples.is_empty()) {
-            let (others, score) = without(&matrix, &frames, samples);
-            let change = others.cholesky().map_or_else(|| &inverse * &score, |others| others.solve(&score));
-            covariance.ger(1.0, &change, &change, 1.0);
+            scatter += &by_picture * by_picture.transpose();
         }
-        // A difference of sums of squares may be slightly negative.
-        let mut eigen = ((&covariance + covariance.transpose()) / 2.0).symmetric_eigen();
-        let least = eigen.eigenvalues.amax() * 1e-12;
-        eigen.eigenvalues.apply(|value| *value = value.max(least));
-        Ok(eigen.recompose())
+        scatter
     }
 
     /// Modes of the covariance of the row starts, `[mode, row]`, and the standard deviations of the row starts.
@@ -158,7 +208,7 @@ fn without(
     let (mut row, mut score) = (DMatrix::zeros(count, count), DVector::zeros(count));
     let mut with = DMatrix::zeros(count, samples.len());
     let mut without = DMatrix::zeros(count, samples.len());
-    for (index, RowSample { frame, edges, sums }) in samples.iter().enumerate() {
+    for (index, RowSample { frame, edges, sums, .. }) in samples.iter().enumerate() {
         let mut own = FrameNormal { frame: *frame, mixed: DVector::zeros(count), weight: 0.0, right: 0.0 };
         own.add(edges, sums, &mut row, &mut score);
         let FrameNormal { mixed, weight, .. } = &frames[*frame];
