@@ -20,7 +20,7 @@ use rig::{Case, Jitter, PROJECTOR_ROWS, PictureNoise, Rig};
 /// Delays of a pass over the arrivals of light.
 const DELAYS: usize = 64;
 /// How often rows are pictured again.
-const RUNS: u64 = 10;
+const RUNS: u64 = 7;
 
 /// Frames of a whole calibration.
 struct Session {
@@ -276,8 +276,8 @@ fn what_other_pictures_of_the_rows_would_change_is_stated() {
         let squares = found.iter().map(|found| (found[index] - mean).powi(2)).sum::<f64>();
         let scatter = (squares / (RUNS - 1) as f64).sqrt();
         println!("{name}: stated {stated:.2e}, scatter {scatter:.2e}, without {:.2e}", without[index].sd);
-        // Nine degrees of freedom tell a standard deviation to a quarter.
-        assert!((0.5..2.0).contains(&(scatter / stated)), "{name}: {scatter:.2e} us, stated {stated:.2e} us");
+        // Six degrees of freedom tell a standard deviation to a third.
+        assert!((0.4..2.5).contains(&(scatter / stated)), "{name}: {scatter:.2e} us, stated {stated:.2e} us");
     }
 }
 

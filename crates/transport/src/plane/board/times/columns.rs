@@ -320,26 +320,28 @@ impl Columns {
         (from_first - row as f64 - self.middles[[index, row]]) / self.cells[index].dwell + 0.5
     }
 
-    /// What the light of a cell would have more, when `drawn` rows (with a fraction) have been drawn, if one of the
-    /// [`PICTURES`] of its response were brighter by all of the cell's light. The sum of its shares stays 1.
-    pub(super) fn error_before(&self, row: usize, group: usize, picture: usize, drawn: f64) -> f64 {
+    /// What the light of a cell would have more, when `drawn` rows (with a fraction) have been drawn, if each of the
+    /// pictures of its response were brighter by all of the cell's light. The sum of its shares stays 1.
+    pub(super) fn errors_before(&self, row: usize, group: usize, drawn: f64) -> [f64; PICTURES] {
         let index = row * self.groups.len() + group;
         let cell = &self.cells[index];
         let first = cell.place.round() as i64 + i64::from(FIRST_RESPONSE_ROW) - cell.first_row;
-        let part = |relative: usize| match usize::try_from(first + relative as i64) {
-            Ok(drawn_row) if drawn_row < cell.rows => {
-                self.part_sent(index, drawn_row, drawn - cell.first_row as f64).clamp(0.0, 1.0)
-            }
-            _ => 0.0,
-        };
         let sent = self.light_before(row, group, drawn).sent;
-        match picture {
-            BLACK => RESPONSE_ROWS as f64 * sent - (0..RESPONSE_ROWS).map(part).sum::<f64>(),
-            _ => part(picture) - sent,
+        let mut errors = [0.0; PICTURES];
+        for (error, drawn_row) in errors.iter_mut().zip(first..).take(RESPONSE_ROWS) {
+            let part = match usize::try_from(drawn_row) {
+                Ok(drawn_row) if drawn_row < cell.rows => {
+                    self.part_sent(index, drawn_row, drawn - cell.first_row as f64).clamp(0.0, 1.0)
+                }
+                _ => 0.0,
+            };
+            *error = part - sent;
         }
+        errors[BLACK] = -errors.iter().sum::<f64>();
+        errors
     }
 
-    /// Variance of the mean of a cell's pixels in one of the [`PICTURES`], in squares of the cell's light, if each response
+    /// Variance of the mean of a cell's pixels in one of the pictures, in squares of the cell's light, if each response
     /// is an average over `averaged` camera rows.
     pub(super) fn picture_variance(&self, row: usize, group: usize, picture: usize, averaged: usize) -> f64 {
         let index = row * self.groups.len() + group;

@@ -18,11 +18,16 @@ struct RowSample {
     /// Index among the frames used.
     frame: usize,
     edges: [Sparse; 2],
-    /// The rows drawn by the opening and by the closing edge.
-    drawn: [f64; 2],
     sums: Sums,
-    /// Those of each group of columns.
-    groups: Vec<Sums>,
+    groups: Vec<GroupSample>,
+}
+
+/// What a group of columns adds to the right side of the normal equations by residuals of 1 on the opening and on the
+/// closing edge, and its residuals if each of the pictures of its response were wrong.
+struct GroupSample {
+    opening: f64,
+    closing: f64,
+    residuals: [f64; PICTURES],
 }
 
 /// The samples of all camera rows, and how the jitter of each frame goes with the unknowns, `[unknown, frame]`.
@@ -32,25 +37,22 @@ struct Samples {
 }
 
 impl Samples {
-    /// What each cell adds to the right side of the normal equations, `[unknown, row * groups + group]`, if its samples
-    /// have these residuals, opening and closing.
-    fn scores(
-        &self,
-        groups: usize,
-        residuals: impl Fn((usize, usize), &RowSample) -> [f64; 2],
-    ) -> DMatrix<f64> {
+    /// What each cell adds to the right side of the normal equations, `[unknown, row * groups + group]`, if one picture
+    /// of its response were wrong.
+    fn scores(&self, groups: usize, picture: usize) -> DMatrix<f64> {
         let (unknowns, frames) = self.jitters.shape();
         let mut scores = DMatrix::zeros(unknowns, self.rows.len() * groups);
         let mut by_jitter = DMatrix::zeros(frames, self.rows.len() * groups);
         for (row, samples) in self.rows.iter().enumerate() {
-            for (sample, group) in
-                samples.iter().flat_map(|sample| (0..groups).map(move |group| (sample, group)))
-            {
-                let cell = row * groups + group;
-                let [opening, closing] = residuals((row, group), sample);
-                for (edge, residual) in sample.edges.iter().zip([-opening, closing]) {
-                    edge.entries().iter().for_each(|&(a, x)| scores[(a, cell)] += residual * x);
-                    by_jitter[(sample.frame, cell)] -= residual;
+            for sample in samples {
+                for (group, of_group) in sample.groups.iter().enumerate() {
+                    let cell = row * groups + group;
+                    let residual = of_group.residuals[picture];
+                    let mut scores = scores.column_mut(cell);
+                    for (edge, weight) in sample.edges.iter().zip([-of_group.opening, of_group.closing]) {
+                        edge.entries().iter().for_each(|&(a, x)| scores[a] += weight * residual * x);
+                        by_jitter[(sample.frame, cell)] -= weight * residual;
+                    }
                 }
             }
         }
@@ -64,14 +66,16 @@ impl Fit<'_> {
     /// Residuals are not independent: the brightness of a drawn row is wrong in all columns and all frames, and the
     /// response of a few columns over many rows. The inverse of the normal matrix alone would be several times too
     /// small. So the scatter of the scores is that of whole camera rows, and what is known of the errors of responses is
-    /// added: residuals do not show them, because the table gives way to them. Jitters and priors are independent and
+    /// added: residuals do not show them, because the fit gives way to them. Jitters and priors are independent and
     /// enter as they are. A camera row draws the table towards its own error, the more the nearer it is to an end, so
     /// its scores are those at the unknowns that the other rows give (the jackknife: CR3 of Bell and McCaffrey 2002).
     pub(super) fn covariance(&self, free: bool) -> Result<DMatrix<f64>, TimesError> {
         let Normal { matrix, frames, .. } = self.normal(free);
         let count = self.unknowns.len();
         let samples = self.samples(&frames);
-        let mut scatter = self.scatter_of_responses(&samples);
+        // A difference of exposures is refused far beyond what responses do to it.
+        let mut scatter =
+            if free { DMatrix::zeros(count, count) } else { self.scatter_of_responses(&samples) };
         scatter += &samples.jitters * samples.jitters.transpose() * self.jitter_prior_us.powi(-2);
         let mut right = DVector::zeros(count);
         self.add_priors(&mut scatter, &mut right, free);
@@ -96,12 +100,16 @@ impl Fit<'_> {
             let late = (self.late_us[own.frame], self.longer_us(own.frame));
             jitters.set_column(index, &(&own.mixed / own.weight));
             comparison.visit(frame, late, BoardSamples::OnEdges, |row, opening, closing, sums| {
-                let of_group =
-                    |group| comparison.compare(frame, row, group..group + 1, (opening, closing), false);
+                let of_group = |group| {
+                    let sums = comparison.compare(frame, row, group..group + 1, (opening, closing), false);
+                    let [before, until] =
+                        [opening, closing].map(|edge| self.columns.errors_before(row, group, edge.drawn()));
+                    let residuals = std::array::from_fn(|picture| before[picture] - until[picture]);
+                    GroupSample { opening: sums.opening, closing: sums.closing, residuals }
+                };
                 rows[row].push(RowSample {
                     frame: index,
                     edges: self.edges(own.frame, row, opening, closing),
-                    drawn: [opening.drawn(), closing.drawn()],
                     sums: *sums,
                     groups: (0..groups).map(of_group).collect(),
                 });
@@ -117,12 +125,7 @@ impl Fit<'_> {
         let near = |row: usize| row.saturating_sub(REACH_ROWS)..(row + REACH_ROWS + 1).min(rows);
         let mut scatter = DMatrix::zeros(self.unknowns.len(), self.unknowns.len());
         for picture in 0..PICTURES {
-            let by_share = samples.scores(groups, |(row, group), sample| {
-                let [before, until] =
-                    sample.drawn.map(|drawn| self.columns.error_before(row, group, picture, drawn));
-                let Sums { opening, closing, .. } = sample.groups[group];
-                [opening * (before - until), closing * (before - until)]
-            });
+            let by_share = samples.scores(groups, picture);
             let mut by_picture = DMatrix::zeros(self.unknowns.len(), rows * groups);
             for (row, group) in (0..rows).flat_map(|row| (0..groups).map(move |group| (row, group))) {
                 let mut sum = by_picture.column_mut(row * groups + group);
