@@ -341,6 +341,17 @@ impl Columns {
         errors
     }
 
+    /// The part of the pixels that a group's responses are averaged over which lie in another group.
+    pub(super) fn averaged_from(&self, group: usize, other: usize) -> f64 {
+        let (columns, other) = (self.lit.ncols(), &self.groups[other]);
+        let part = |column: usize| {
+            let window = column.saturating_sub(REACH_COLUMNS)..(column + REACH_COLUMNS + 1).min(columns);
+            let common = window.end.min(other.end).saturating_sub(window.start.max(other.start));
+            common as f64 / window.len() as f64
+        };
+        self.groups[group].clone().map(part).sum::<f64>() / self.groups[group].len() as f64
+    }
+
     /// Variance of the mean of a cell's pixels in one of the pictures, in squares of the cell's light, if each response
     /// is an average over `averaged` camera rows.
     pub(super) fn picture_variance(&self, row: usize, group: usize, picture: usize, averaged: usize) -> f64 {

@@ -119,21 +119,26 @@ impl Fit<'_> {
     }
 
     /// The scatter of the scores that comes from the noise of the pictures of rows, from which each response is averaged
-    /// over the camera rows near it.
+    /// over the pixels near it.
     fn scatter_of_responses(&self, samples: &Samples) -> DMatrix<f64> {
         let (rows, groups) = (self.columns.rows(), self.columns.groups());
         let near = |row: usize| row.saturating_sub(REACH_ROWS)..(row + REACH_ROWS + 1).min(rows);
+        let averaged =
+            DMatrix::from_fn(groups, groups, |group, other| self.columns.averaged_from(group, other));
         let mut scatter = DMatrix::zeros(self.unknowns.len(), self.unknowns.len());
         for picture in 0..PICTURES {
             let by_share = samples.scores(groups, picture);
             let mut by_picture = DMatrix::zeros(self.unknowns.len(), rows * groups);
-            for (row, group) in (0..rows).flat_map(|row| (0..groups).map(move |group| (row, group))) {
-                let mut sum = by_picture.column_mut(row * groups + group);
-                for averaged in near(row) {
-                    let share = 1.0 / near(averaged).len() as f64;
-                    sum.axpy(share, &by_share.column(averaged * groups + group), 1.0);
+            for row in 0..rows {
+                let mut sum = DMatrix::zeros(self.unknowns.len(), groups);
+                for row in near(row) {
+                    sum += by_share.columns(row * groups, groups) / near(row).len() as f64;
                 }
-                sum *= self.columns.picture_variance(row, group, picture, near(row).len()).sqrt();
+                let mut by_picture = by_picture.columns_mut(row * groups, groups);
+                by_picture.gemm(1.0, &sum, &averaged, 0.0);
+                for (group, mut score) in by_picture.column_iter_mut().enumerate() {
+                    score *= self.columns.picture_variance(row, group, picture, near(row).len()).sqrt();
+                }
             }
             scatter += &by_picture * by_picture.transpose();
         }
