@@ -52,8 +52,9 @@ pub struct Case {
     pub slopes: Slopes,
     /// Standard deviation of the brightness of drawn rows.
     pub unevenness: f64,
-    /// Standard deviation of the shares of a response.
-    pub response_error: f64,
+    /// Noise of a pixel in the picture of a row, as a share of its light; half of it in the black picture, of which there are
+    /// more frames.
+    pub picture_noise: f64,
 }
 
 impl Case {
@@ -76,7 +77,7 @@ impl Case {
             global_delay_acts: true,
             slopes: [0.0, 0.0],
             unevenness: 0.01,
-            response_error: 0.0002,
+            picture_noise: 0.003,
         }
     }
 
@@ -150,7 +151,7 @@ impl Rig {
             let centre = centres[[t, s]] - (BEAM_BELOW - BEAM_ABOVE) / 2.0;
             if lit(t, s) { centre as f32 } else { f32::NAN }
         });
-        let pictures = PictureNoise { share: case.response_error, common: case.response_error / 2.0 };
+        let pictures = PictureNoise { row: case.picture_noise, black: case.picture_noise / 2.0 };
         let errors = pictures.errors(shape, &mut random);
         let mut responses = pictures.unmeasured(&place);
         for ((t, s), &place) in place.indexed_iter().filter(|(_, place)| place.is_finite()) {
@@ -256,44 +257,39 @@ impl Rig {
     }
 }
 
-/// Noise of the pictures from which responses are made. Each is averaged over 21 rows and 9 columns, so that neighbours err
-/// alike, and the black one is subtracted from all.
+/// Noise of a single pixel in the pictures from which responses are made, as a share of its light. Each response is averaged
+/// over 21 rows and 9 columns, so that neighbours err alike, and the black picture is subtracted from all.
 pub struct PictureNoise {
-    /// Standard deviation of each share.
-    pub share: f64,
-    /// Standard deviation of what all shares have in common.
-    pub common: f64,
+    pub row: f64,
+    pub black: f64,
 }
 
 impl PictureNoise {
-    /// Errors of the shares that are seen, `[16, t, s]`.
+    /// Errors of all shares, `[16, t, s]`.
     fn errors(&self, shape: (usize, usize), random: &mut Xoshiro256PlusPlus) -> Array3<f64> {
         let unit = Normal::new(0.0, 1.0).unwrap();
         let mut averaged = |sd: f64| {
-            let picture = Array2::from_shape_fn(shape, |_| 189.0_f64.sqrt() * sd * unit.sample(random));
+            let picture = Array2::from_shape_fn(shape, |_| sd * unit.sample(random));
             Array2::from_shape_fn(shape, |(t, s)| near(&picture, (t, s)).mean().unwrap())
         };
-        let black = averaged(self.common);
+        let black = averaged(self.black);
         let mut errors = Array3::zeros((16, shape.0, shape.1));
         for mut errors in errors.outer_iter_mut() {
-            errors.assign(&(averaged(self.share) - &black));
+            errors.assign(&(averaged(self.row) - &black));
         }
         errors
     }
 
-    /// Responses at these places that state these errors, and have no shares yet.
+    /// Responses at these places that state this noise, and have no shares yet.
     fn unmeasured(&self, place: &Array2<f32>) -> Responses {
         let shape = place.dim();
-        let sd = |sd: f64| {
-            Array2::from_shape_fn(shape, |at| (sd * (189.0 / near(place, at).len() as f64).sqrt()) as f32)
-        };
-        let share_sd = sd(self.share.hypot(self.common));
+        let of = |picture: usize| if picture < 16 { self.row } else { self.black };
         Responses {
             place: place.clone(),
             place_sd: Array2::zeros(shape),
             response: Array3::zeros((16, shape.0, shape.1)),
-            response_sd: share_sd.broadcast((16, shape.0, shape.1)).unwrap().to_owned(),
-            common_sd: sd(self.common),
+            response_sd: Array3::zeros((16, shape.0, shape.1)),
+            picture_sd: Array3::from_shape_fn((17, shape.0, shape.1), |(picture, ..)| of(picture) as f32),
             checks: ResponseChecks {
                 sum_of_phases: 1.0,
                 two_peaks: 0.0,

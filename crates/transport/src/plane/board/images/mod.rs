@@ -27,7 +27,7 @@ pub use place::{CodedPictures, Phases, RowPlaces, locate_columns, locate_rows};
 pub use response::{Narrower, ResponseChecks, ResponseComparison, Responses, compare_responses};
 pub use white::WhiteMap;
 
-pub(super) use response::{REACH_COLUMNS, REACH_ROWS};
+pub(super) use response::{PICTURES, REACH_COLUMNS, REACH_ROWS};
 
 use ndarray::{Array2, ArrayView2, ArrayView3, Axis};
 use rayon::prelude::*;

@@ -7,11 +7,13 @@ use rayon::prelude::*;
 use super::super::super::PlaneError;
 use super::super::super::model::{FIRST_RESPONSE_ROW, PixelResponse, RESPONSE_ROWS};
 use super::place::{PHASES, Phases, RowPlaces};
-use super::{Estimate, ImagesError, WhiteMap, check_frames, check_shape, median};
+use super::{Estimate, ImagesError, SensorNoise, WhiteMap, check_frames, check_shape, median};
 
 /// The drawn rows of a response, relative to the row nearest to the pixel's place.
 const ROWS: RangeInclusive<i32> = FIRST_RESPONSE_ROW..=FIRST_RESPONSE_ROW + RESPONSE_ROWS as i32 - 1;
 
+/// The pictures from which a response is made: one for each of its rows, and the black one, which is subtracted from all.
+pub(in super::super) const PICTURES: usize = RESPONSE_ROWS + 1;
 /// A pixel's own row is at this index of its response.
 const OWN: i32 = -FIRST_RESPONSE_ROW;
 /// Counts are averaged over this many camera rows above and below.
@@ -46,9 +48,10 @@ pub struct Responses {
     pub response: Array3<f32>,
     /// Its standard deviation, `[16, t, s]`.
     pub response_sd: Array3<f32>,
-    /// The part of it that all shares of a pixel have in common, because the same black picture was subtracted from all
-    /// pictures, `[t, s]`.
-    pub common_sd: Array2<f32>,
+    /// Noise of the pictures from which it is averaged: the standard deviation of the pixel alone in the picture of each of
+    /// these rows, and last in the black one, which is subtracted from all, as shares of its light, `[17, t, s]`. 0 for
+    /// rows that do not exist.
+    pub picture_sd: Array3<f32>,
     /// What the images say about projector and board.
     pub checks: ResponseChecks,
 }
@@ -136,27 +139,34 @@ impl Responses {
         check_frames(phases.frames, 1)?;
         check_shape("phases", "[pictures, t, s]", phases.images.shape(), &[PHASES, rows, columns])?;
         check_shape("white_dn", "[t, s]", white.white_dn.shape(), &[rows, columns])?;
-        let black_sd_dn = white.black_sd_dn;
-        let window = Window { light: by_pixel(phases), place: &places.place, black_sd_dn, projector_rows };
+        let window = Window {
+            light: by_pixel(phases),
+            place: &places.place,
+            noise: white.noise,
+            frames: [phases.frames, white.black_frames],
+            projector_rows,
+        };
         let mut place = Array2::from_elem(shape, f32::NAN);
-        let (mut place_sd, mut common_sd) = (place.clone(), place.clone());
+        let mut place_sd = place.clone();
         let mut response = Array3::from_elem((PHASES, rows, columns), f32::NAN);
         let mut response_sd = response.clone();
+        let mut picture_sd = Array3::from_elem((PICTURES, rows, columns), f32::NAN);
         place
             .axis_iter_mut(Axis(0))
             .into_par_iter()
-            .zip(place_sd.axis_iter_mut(Axis(0)).into_par_iter().zip(common_sd.axis_iter_mut(Axis(0))))
+            .zip(place_sd.axis_iter_mut(Axis(0)))
             .zip(response.axis_iter_mut(Axis(1)).into_par_iter().zip(response_sd.axis_iter_mut(Axis(1))))
+            .zip(picture_sd.axis_iter_mut(Axis(1)))
             .enumerate()
             .for_each(
-                |(t, ((mut place, (mut place_sd, mut common_sd)), (mut response, mut response_sd)))| {
+                |(t, (((mut place, mut place_sd), (mut response, mut response_sd)), mut picture_sd))| {
                     for s in 0..columns {
                         if let Some(pixel) = window.pixel(t, s) {
                             place[s] = pixel.place;
                             place_sd[s] = pixel.place_sd;
-                            common_sd[s] = pixel.common_sd;
                             response.column_mut(s).assign(&ArrayView1::from(&pixel.response));
                             response_sd.column_mut(s).assign(&ArrayView1::from(&pixel.response_sd));
+                            picture_sd.column_mut(s).assign(&ArrayView1::from(&pixel.picture_sd));
                         }
                     }
                 },
@@ -171,7 +181,7 @@ impl Responses {
             place_rms_rows: places.rms,
             ..checks(&response)
         };
-        Ok(Self { place, place_sd, response, response_sd, common_sd, checks })
+        Ok(Self { place, place_sd, response, response_sd, picture_sd, checks })
     }
 
     /// Standard deviation of the width of a response relative to itself: the median over the lit pixels. The shares are
@@ -232,7 +242,9 @@ struct Window<'a> {
     /// `[t, s, 16]`.
     light: Array3<f32>,
     place: &'a Array2<f32>,
-    black_sd_dn: f64,
+    noise: SensorNoise,
+    /// Number of frames in the picture of each row, and in the black one.
+    frames: [usize; 2],
     projector_rows: usize,
 }
 
@@ -241,7 +253,7 @@ struct Pixel {
     place_sd: f32,
     response: [f32; PHASES],
     response_sd: [f32; PHASES],
-    common_sd: f32,
+    picture_sd: [f32; PICTURES],
 }
 
 /// Mean counts of one camera row's pixels, by relative row.
@@ -367,9 +379,25 @@ impl Window<'_> {
             place_sd: (factor * centroid_square.sqrt()) as f32,
             response: response.map(|share| (share / kept) as f32),
             response_sd: turned(&squares).map(|square| (factor * square.sqrt() / kept) as f32),
-            common_sd: (self.black_sd_dn / means.iter().map(|row| row.pixels).sum::<f64>().sqrt() / total)
-                as f32,
+            picture_sd: std::array::from_fn(|picture| {
+                self.picture_sd(&response, picture, own_row + moved, total)
+            }),
         })
+    }
+}
+
+impl Window<'_> {
+    /// Noise of a pixel alone in one picture of its response about `own_row`, as a share of its light of `total_dn`.
+    fn picture_sd(&self, shares: &[f64; PHASES], picture: usize, own_row: i32, total_dn: f64) -> f32 {
+        let [frames, black_frames] = self.frames;
+        let variance_dn2 = match shares.get(picture) {
+            Some(share) if self.exists(own_row + picture as i32 - OWN) => {
+                self.noise.variance_dn2(share * total_dn) / frames as f64
+            }
+            Some(_) => 0.0,
+            None => self.noise.variance_dn2(0.0) / black_frames as f64,
+        };
+        (variance_dn2.sqrt() / total_dn) as f32
     }
 }
 
@@ -584,8 +612,9 @@ mod tests {
             });
         let checks =
             ResponseChecks { sum_of_phases: 1.0, two_peaks: 0.0, far_light: 0.0, place_rms_rows: 0.0 };
-        let (place_sd, common_sd, response_sd) = (place.clone(), place.clone(), response.clone());
-        let responses = Responses { place, place_sd, response, response_sd, common_sd, checks };
+        let (place_sd, response_sd) = (place.clone(), response.clone());
+        let picture_sd = Array3::zeros((PICTURES, 2, 3));
+        let responses = Responses { place, place_sd, response, response_sd, picture_sd, checks };
         let filled = responses.pixel_response().unwrap();
         assert_eq!(filled.places().as_slice().unwrap(), [10.2, 10.3, 10.3, 11.2, 11.3, 11.3]);
         assert_eq!(filled.shares()[[8, 0, 2]], 1.0);

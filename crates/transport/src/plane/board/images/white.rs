@@ -12,8 +12,10 @@ pub struct WhiteMap {
     pub white_dn: Array2<f32>,
     /// Its standard deviation by the noise of the frames, `[t, s]`.
     pub sd_dn: Array2<f32>,
-    /// Standard deviation of a pixel of the black picture by the noise of its frames.
-    pub black_sd_dn: f64,
+    /// Noise of a frame.
+    pub noise: SensorNoise,
+    /// Number of frames of the black picture.
+    pub black_frames: usize,
     /// Median over the lit pixels; the standard deviation contains the changes of all pixels from frame to frame.
     pub level_dn: Estimate,
     /// Share of the pixels that are lit.
@@ -64,7 +66,8 @@ impl WhiteMap {
             saturated: share(&saturated),
             white_dn,
             sd_dn,
-            black_sd_dn: black_variance_dn2.sqrt(),
+            noise,
+            black_frames,
         })
     }
 

@@ -5,7 +5,7 @@ use ndarray::{Array2, ArrayView1, ArrayView2, ArrayView3, s};
 use super::super::super::PlaneError;
 use super::super::super::error::check_shape;
 use super::super::super::model::{FIRST_RESPONSE_ROW, FlyingSpot, RESPONSE_ROWS, Scan};
-use super::super::images::{REACH_COLUMNS, Responses};
+use super::super::images::{PICTURES, REACH_COLUMNS, Responses};
 
 /// Largest number of groups into which the columns of the image are averaged. More groups hardly help: they differ
 /// only in the fraction of a row at which their pixels lie.
@@ -13,9 +13,8 @@ const GROUPS: usize = 12;
 /// Least part of the projector's width that a group of columns is taken to see: a spot is not a point.
 const LEAST_WIDTH: f64 = 1.0 / 32.0;
 
-/// The pictures from which a response is made: one for each of its rows, and the black one, which is subtracted from all.
-pub(super) const PICTURES: usize = RESPONSE_ROWS + 1;
-const BLACK: usize = RESPONSE_ROWS;
+/// The last of the pictures of a response.
+const BLACK: usize = PICTURES - 1;
 
 /// What each camera row sees of each drawn row, averaged over groups of neighbouring columns.
 ///
@@ -32,7 +31,8 @@ pub struct Columns {
     cumulative: Array2<f64>,
     /// The fraction of each row's dwell that has passed when half of its light has been sent, of the same shape.
     middles: Array2<f64>,
-    /// Mean variance of a cell's pixels by the noise of each picture, `[row * groups + group, 17]`.
+    /// Variance of the mean of a cell's pixels in each picture of its response, in squares of its light,
+    /// `[row * groups + group, 17]`.
     picture_variances: Array2<f64>,
     /// For each camera row, the drawn rows that any of its cells sees.
     reach: Vec<(f64, f64)>,
@@ -182,25 +182,25 @@ impl Columns {
         })
     }
 
-    /// The same with the errors of these responses.
+    /// The same with the noise of the pictures from which these responses were averaged.
     ///
     /// # Errors
-    /// [`PlaneError::Shape`] if they have another shape.
+    /// [`PlaneError::Shape`] if they have another shape; [`PlaneError::OutOfRange`] for a lit pixel without a noise.
     pub fn with_errors_of(mut self, responses: &Responses) -> Result<Self, PlaneError> {
-        let Responses { response_sd, common_sd, .. } = responses;
+        let picture_sd = &responses.picture_sd;
         let (rows, columns) = self.lit.dim();
-        check_shape("response_sd", "[16, t, s]", response_sd.shape(), &[RESPONSE_ROWS, rows, columns])?;
-        check_shape("common_sd", "[t, s]", common_sd.shape(), &[rows, columns])?;
+        check_shape("picture_sd", "[17, t, s]", picture_sd.shape(), &[PICTURES, rows, columns])?;
         let count = self.groups.len();
         for (index, cell) in self.cells.iter().enumerate() {
             let (row, mut variances) = (index / count, self.picture_variances.row_mut(index));
             for column in self.groups[index % count].clone().filter(|&column| self.lit[[row, column]]) {
-                let variance = |sd: f32| f64::from(sd).powi(2) / cell.pixels as f64;
-                let common = variance(common_sd[[row, column]]);
-                variances[BLACK] += common;
-                for (own, &sd) in variances.iter_mut().zip(response_sd.slice(s![.., row, column])) {
-                    *own += (variance(sd) - common).max(0.0);
+                for (variance, &sd) in variances.iter_mut().zip(picture_sd.slice(s![.., row, column])) {
+                    *variance += (f64::from(sd) / cell.pixels as f64).powi(2);
                 }
+            }
+            if let Some(&value) = variances.iter().find(|variance| !variance.is_finite()) {
+                let allowed = "finite: give pixels without a noise no place either";
+                return Err(PlaneError::OutOfRange { field: "picture_sd of a lit pixel", value, allowed });
             }
         }
         Ok(self)
@@ -337,11 +337,14 @@ impl Columns {
             };
             *error = part - sent;
         }
-        errors[BLACK] = -errors.iter().sum::<f64>();
+        // Rows that do not exist have no picture.
+        let pictures = errors.iter().zip(self.picture_variances.row(index));
+        errors[BLACK] =
+            -pictures.filter(|(_, variance)| **variance > 0.0).map(|(error, _)| error).sum::<f64>();
         errors
     }
 
-    /// The part of the pixels that a group's responses are averaged over which lie in another group.
+    /// The part of the pixels that a group's responses are averaged over which lie in group `other`.
     pub(super) fn averaged_from(&self, group: usize, other: usize) -> f64 {
         let (columns, other) = (self.lit.ncols(), &self.groups[other]);
         let part = |column: usize| {
@@ -352,12 +355,9 @@ impl Columns {
         self.groups[group].clone().map(part).sum::<f64>() / self.groups[group].len() as f64
     }
 
-    /// Variance of the mean of a cell's pixels in one of the pictures, in squares of the cell's light, if each response
-    /// is an average over `averaged` camera rows.
-    pub(super) fn picture_variance(&self, row: usize, group: usize, picture: usize, averaged: usize) -> f64 {
-        let index = row * self.groups.len() + group;
-        let pixels = averaged * (2 * REACH_COLUMNS + 1);
-        self.picture_variances[[index, picture]] * pixels as f64 / self.cells[index].pixels.max(1) as f64
+    /// Standard deviation of the mean of a cell's pixels in one of the pictures of its response, as a share of its light.
+    pub(super) fn picture_sd(&self, row: usize, group: usize, picture: usize) -> f64 {
+        self.picture_variances[[row * self.groups.len() + group, picture]].sqrt()
     }
 }
 

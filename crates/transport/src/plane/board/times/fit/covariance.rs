@@ -2,8 +2,7 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use super::super::super::images::REACH_ROWS;
-use super::super::columns::PICTURES;
+use super::super::super::images::{PICTURES, REACH_ROWS};
 use super::super::error::TimesError;
 use super::super::model::{BoardSamples, Sums};
 use super::{Fit, FrameNormal, Normal, Sparse};
@@ -23,7 +22,7 @@ struct RowSample {
 }
 
 /// What a group of columns adds to the right side of the normal equations by residuals of 1 on the opening and on the
-/// closing edge, and its residuals if each of the pictures of its response were wrong.
+/// closing edge, and its residuals if each of the pictures of its response were brighter by all of its light.
 struct GroupSample {
     opening: f64,
     closing: f64,
@@ -38,7 +37,7 @@ struct Samples {
 
 impl Samples {
     /// What each cell adds to the right side of the normal equations, `[unknown, row * groups + group]`, if one picture
-    /// of its response were wrong.
+    /// of its response were brighter by all of its light.
     fn scores(&self, groups: usize, picture: usize) -> DMatrix<f64> {
         let (unknowns, frames) = self.jitters.shape();
         let mut scores = DMatrix::zeros(unknowns, self.rows.len() * groups);
@@ -66,14 +65,14 @@ impl Fit<'_> {
     /// Residuals are not independent: the brightness of a drawn row is wrong in all columns and all frames, and the
     /// response of a few columns over many rows. The inverse of the normal matrix alone would be several times too
     /// small. So the scatter of the scores is that of whole camera rows, and what is known of the errors of responses is
-    /// added: residuals do not show them, because the fit gives way to them. Jitters and priors are independent and
+    /// added: residuals hardly show them, because the fit gives way to them. Jitters and priors are independent and
     /// enter as they are. A camera row draws the table towards its own error, the more the nearer it is to an end, so
     /// its scores are those at the unknowns that the other rows give (the jackknife: CR3 of Bell and McCaffrey 2002).
     pub(super) fn covariance(&self, free: bool) -> Result<DMatrix<f64>, TimesError> {
         let Normal { matrix, frames, .. } = self.normal(free);
         let count = self.unknowns.len();
         let samples = self.samples(&frames);
-        // A difference of exposures is refused far beyond what responses do to it.
+        // The differences between exposures are only judged, five standard deviations beyond a limit.
         let mut scatter =
             if free { DMatrix::zeros(count, count) } else { self.scatter_of_responses(&samples) };
         scatter += &samples.jitters * samples.jitters.transpose() * self.jitter_prior_us.powi(-2);
@@ -82,7 +81,7 @@ impl Fit<'_> {
         let inverse = matrix.clone().cholesky().ok_or(TimesError::Undetermined)?.inverse();
         let mut covariance = &inverse * scatter * &inverse;
         for samples in samples.rows.iter().filter(|samples| !samples.is_empty()) {
-            let (others, score) = without(&matrix, &frames, samples);
+            let (others, score) = without_row(&matrix, &frames, samples);
             let change = others.cholesky().map_or_else(|| &inverse * &score, |others| others.solve(&score));
             covariance.ger(1.0, &change, &change, 1.0);
         }
@@ -127,20 +126,20 @@ impl Fit<'_> {
             DMatrix::from_fn(groups, groups, |group, other| self.columns.averaged_from(group, other));
         let mut scatter = DMatrix::zeros(self.unknowns.len(), self.unknowns.len());
         for picture in 0..PICTURES {
-            let by_share = samples.scores(groups, picture);
-            let mut by_picture = DMatrix::zeros(self.unknowns.len(), rows * groups);
+            let of_responses = samples.scores(groups, picture);
+            let mut of_pixels = DMatrix::zeros(self.unknowns.len(), rows * groups);
             for row in 0..rows {
                 let mut sum = DMatrix::zeros(self.unknowns.len(), groups);
-                for row in near(row) {
-                    sum += by_share.columns(row * groups, groups) / near(row).len() as f64;
+                for other in near(row) {
+                    sum += of_responses.columns(other * groups, groups) / near(other).len() as f64;
                 }
-                let mut by_picture = by_picture.columns_mut(row * groups, groups);
-                by_picture.gemm(1.0, &sum, &averaged, 0.0);
-                for (group, mut score) in by_picture.column_iter_mut().enumerate() {
-                    score *= self.columns.picture_variance(row, group, picture, near(row).len()).sqrt();
+                let mut of_pixels = of_pixels.columns_mut(row * groups, groups);
+                of_pixels.gemm(1.0, &sum, &averaged, 0.0);
+                for (group, mut score) in of_pixels.column_iter_mut().enumerate() {
+                    score *= self.columns.picture_sd(row, group, picture);
                 }
             }
-            scatter += &by_picture * by_picture.transpose();
+            scatter += &of_pixels * of_pixels.transpose();
         }
         scatter
     }
@@ -207,7 +206,7 @@ impl Fit<'_> {
 
 /// The normal matrix without the samples of one camera row, and how far that row draws the others' normal equations:
 /// the jitters of its frames are found again without it, too, because few rows tell a frame with two borders its jitter.
-fn without(
+fn without_row(
     matrix: &DMatrix<f64>,
     frames: &[FrameNormal],
     samples: &[RowSample],
