@@ -219,8 +219,8 @@ fn hold(client: &mut Client) -> Duration {
     held
 }
 
-/// No frame of the film was exposed for that time. (When frames were stored says nothing: those of before a pause may be
-/// stored in the midst of it.)
+/// No frame of a stored cycle was exposed for that time. (When frames were stored says nothing: those of before a pause may
+/// be stored in the midst of it.)
 fn assert_is_held(session: &Session, held: Duration) {
     let state = session.state().unwrap();
     let starts_ns: Vec<i64> = state.cycles().flat_map(|cycle| cycle.starts_ns.clone()).collect();

@@ -9,6 +9,7 @@
 //! Projector rows count from 0, and row `v` has its centre at `v`. A pixel's place `p` is a position on that scale.
 
 mod ambient;
+mod comparison;
 mod dark;
 mod error;
 mod linearity;
@@ -19,12 +20,13 @@ mod smooth;
 mod white;
 
 pub use ambient::{Ambient, BlackFrames, Flicker, ambient, steady};
+pub use comparison::{Narrower, ResponseComparison, compare_responses};
 pub use dark::{CappedFrames, DarkFit};
 pub use error::ImagesError;
 pub use linearity::{LightLevel, Linearity, MOST_BEND, SaturationLimit};
 pub use photon_transfer::{PhotonTransfer, photon_transfer, prnu};
 pub use place::{CodedPictures, Phases, RowPlaces, locate_columns, locate_rows};
-pub use response::{Narrower, ResponseChecks, ResponseComparison, Responses, compare_responses};
+pub use response::{ResponseChecks, Responses};
 pub use white::WhiteMap;
 
 pub(super) use response::{PICTURES, REACH_COLUMNS, REACH_ROWS};

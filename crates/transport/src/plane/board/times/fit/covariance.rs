@@ -71,10 +71,10 @@ impl Fit<'_> {
     pub(super) fn covariance(&self, free: bool) -> Result<DMatrix<f64>, TimesError> {
         let Normal { matrix, frames, .. } = self.normal(free);
         let count = self.unknowns.len();
-        let samples = self.samples(&frames);
         // The differences between exposures are only judged, five standard deviations beyond a limit.
-        let mut scatter =
-            if free { DMatrix::zeros(count, count) } else { self.scatter_of_responses(&samples) };
+        let groups = if free { 0 } else { self.columns.groups() };
+        let samples = self.samples(&frames, groups);
+        let mut scatter = self.scatter_of_responses(&samples, groups);
         scatter += &samples.jitters * samples.jitters.transpose() * self.jitter_prior_us.powi(-2);
         let mut right = DVector::zeros(count);
         self.add_priors(&mut scatter, &mut right, free);
@@ -88,8 +88,7 @@ impl Fit<'_> {
         Ok((&covariance + covariance.transpose()) / 2.0)
     }
 
-    fn samples(&self, frames: &[FrameNormal]) -> Samples {
-        let groups = self.columns.groups();
+    fn samples(&self, frames: &[FrameNormal], groups: usize) -> Samples {
         let sweep = self.sweep();
         let comparison = self.comparison(&sweep);
         let mut jitters = DMatrix::zeros(self.unknowns.len(), frames.len());
@@ -119,8 +118,8 @@ impl Fit<'_> {
 
     /// The scatter of the scores that comes from the noise of the pictures of rows, from which each response is averaged
     /// over the pixels near it.
-    fn scatter_of_responses(&self, samples: &Samples) -> DMatrix<f64> {
-        let (rows, groups) = (self.columns.rows(), self.columns.groups());
+    fn scatter_of_responses(&self, samples: &Samples, groups: usize) -> DMatrix<f64> {
+        let rows = self.columns.rows();
         let near = |row: usize| row.saturating_sub(REACH_ROWS)..(row + REACH_ROWS + 1).min(rows);
         let averaged =
             DMatrix::from_fn(groups, groups, |group, other| self.columns.averaged_from(group, other));
