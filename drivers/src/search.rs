@@ -162,8 +162,8 @@ fn entries(folder: &Path) -> Vec<PathBuf> {
 #[cfg(test)]
 mod tests {
     use raysweep_sim::mirror::{
-        MechanicsConfig, MirrorPty, MtiController, PlayzerXController, PlayzerXControllerConfig, Pty,
-        SerialLink, WireFaults,
+        MechanicsConfig, MirrorPty, MtiController, OptotuneController, PlayzerXController,
+        PlayzerXControllerConfig, Pty, SerialLink, WireFaults,
     };
     use raysweep_sim::triggerbox::TriggerBoxPty;
 
@@ -220,14 +220,17 @@ mod tests {
         let playzerx = PlayzerXController::new(PlayzerXControllerConfig::default());
         let playzerx = MirrorPty::plug(playzerx, usb, sound).unwrap();
         let mti = MirrorPty::plug(MtiController::new(MechanicsConfig::default()), usb, sound).unwrap();
+        let optotune =
+            MirrorPty::plug(OptotuneController::new(MechanicsConfig::default()), usb, sound).unwrap();
         let trigger = TriggerBoxPty::plug(16_666_667, usb, sound).unwrap();
         let mute = Pty::plug(Box::new(|_: &[u8], _: i64, _: &mut Vec<u8>| ()), usb, sound).unwrap();
         assert!(matches!(ask(playzerx.path()), Some(Answering::PlayzerX(about)) if !about.is_empty()));
         assert!(matches!(ask(mti.path()), Some(Answering::Mti(about)) if !about.is_empty()));
+        assert!(matches!(ask(optotune.path()), Some(Answering::Optotune(about)) if !about.is_empty()));
         assert!(matches!(ask(trigger.path()), Some(Answering::TriggerBox(14))));
         assert_eq!(ask(mute.path()), None);
         assert_eq!(ask(Path::new("/nonexistent")), None);
-        for mirror in [&playzerx, &mti] {
+        for mirror in [&playzerx, &mti, &optotune] {
             let held = mirror.truth().held;
             assert!(held.iter().all(|held| (held.x, held.y, held.light) == (0.0, 0.0, 0)), "moved or lit");
         }
