@@ -438,7 +438,8 @@ fn between_its_cycles_a_film_shows_sliding_estimates_where_there_is_time() {
     assert_eq!((film.sliding_estimates, film.transports), (sliding, whole));
     let (session, _) = ended.open();
     let transports = TransportFilm::open(&session.transport_film_path()).unwrap();
-    let stored = (0..whole + 1).filter(|&cycle| transports.read(cycle).unwrap().is_some()).count();
+    // A busy machine may lose cycles between those that it stores.
+    let stored = (0..4000).filter(|&cycle| transports.read(cycle).unwrap().is_some()).count();
     assert_eq!(stored, whole, "those of whole cycles are stored, and no others");
 }
 
