@@ -358,6 +358,11 @@ fn responses_and_places() {
         assert!(l2 < 0.01, "{name}: {l2}");
         assert!(rms < 0.03 && worst < 0.05, "{name}: {rms} {worst}");
         assert_eq!(measured.places.misread, 0.0);
+        // Pixels at the edges of the image have neighbours on one side only.
+        let of_column = |s: usize| (0..shape.0).map(|t| error(&(t, s))).sum::<f64>() / shape.0 as f64;
+        let edges = [0, 1, shape.1 - 2, shape.1 - 1].map(of_column);
+        println!("{name}: places at the edges of the image off by {edges:.4?}");
+        assert!(edges.iter().all(|edge| edge.abs() < 0.005), "{name}: {edges:?}");
         // The response's centroid is the place, and its shares sum to 1.
         for &(t, s) in pixels.iter().step_by(97) {
             let shares = measured.responses.response.slice(ndarray::s![.., t, s]);

@@ -1,4 +1,4 @@
-use std::ops::RangeInclusive;
+use std::ops::{Range, RangeInclusive};
 
 use ndarray::{Array2, Array3, ArrayView1, Axis};
 use rayon::prelude::*;
@@ -18,7 +18,7 @@ const OWN: i32 = -FIRST_RESPONSE_ROW;
 /// Counts are averaged over this many camera rows above and below.
 pub(in super::super) const REACH_ROWS: usize = 10;
 /// Counts are averaged over at most this many columns to the left and right.
-pub(in super::super) const REACH_COLUMNS: usize = 4;
+pub(super) const REACH_COLUMNS: usize = 4;
 /// Pixels are averaged whose places differ by whole rows to within this.
 const MOST_SHIFT_ROWS: f32 = 0.05;
 /// The sum of the pictures may differ from white by this share.
@@ -290,7 +290,7 @@ impl Window<'_> {
 
     /// The pixels of a camera row whose places differ from `place` by a whole number of rows.
     fn row(&self, t: usize, s: usize, place: f32) -> Option<RowMean> {
-        let columns = s.saturating_sub(REACH_COLUMNS)..(s + REACH_COLUMNS + 1).min(self.place.ncols());
+        let columns = near_columns(s, self.place.ncols());
         let mut by_phase = [0.0_f32; PHASES];
         let (mut pixels, mut steps, mut shifts) = (0, 0.0, 0.0);
         let places = self.place.row(t);
@@ -433,6 +433,13 @@ impl Line {
         let weight = row.pixels * (xx - row.shift_rows * x) / self.determinant;
         weight * (row.counts[index] - self.counts - self.per_row * row.shift_rows)
     }
+}
+
+/// The columns that are averaged with one: as many to its left as to its right, so that a board that is turned against the
+/// camera moves no response.
+pub(in super::super) fn near_columns(column: usize, columns: usize) -> Range<usize> {
+    let reach = REACH_COLUMNS.min(column).min(columns - 1 - column);
+    column - reach..column + reach + 1
 }
 
 /// The picture in which a row is lit.

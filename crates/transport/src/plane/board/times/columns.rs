@@ -5,7 +5,7 @@ use ndarray::{Array2, ArrayView1, ArrayView2, ArrayView3, s};
 use super::super::super::PlaneError;
 use super::super::super::error::check_shape;
 use super::super::super::model::{FIRST_RESPONSE_ROW, FlyingSpot, RESPONSE_ROWS, Scan};
-use super::super::images::{PICTURES, REACH_COLUMNS, Responses};
+use super::super::images::{PICTURES, Responses, near_columns};
 
 /// Largest number of groups into which the columns of the image are averaged. More groups hardly help: they differ
 /// only in the fraction of a row at which their pixels lie.
@@ -31,7 +31,7 @@ pub struct Columns {
     cumulative: Array2<f64>,
     /// The fraction of each row's dwell that has passed when half of its light has been sent, of the same shape.
     middles: Array2<f64>,
-    /// Variance of the mean of a cell's pixels in each picture of its response, in squares of its light,
+    /// Mean variance of a cell's pixels in each picture of its response, in squares of its light,
     /// `[row * groups + group, 17]`.
     picture_variances: Array2<f64>,
     /// For each camera row, the drawn rows that any of its cells sees.
@@ -195,7 +195,7 @@ impl Columns {
             let (row, mut variances) = (index / count, self.picture_variances.row_mut(index));
             for column in self.groups[index % count].clone().filter(|&column| self.lit[[row, column]]) {
                 for (variance, &sd) in variances.iter_mut().zip(picture_sd.slice(s![.., row, column])) {
-                    *variance += (f64::from(sd) / cell.pixels as f64).powi(2);
+                    *variance += f64::from(sd).powi(2) / cell.pixels as f64;
                 }
             }
             if let Some(&value) = variances.iter().find(|variance| !variance.is_finite()) {
@@ -344,20 +344,27 @@ impl Columns {
         errors
     }
 
-    /// The part of the pixels that a group's responses are averaged over which lie in group `other`.
-    pub(super) fn averaged_from(&self, group: usize, other: usize) -> f64 {
-        let (columns, other) = (self.lit.ncols(), &self.groups[other]);
-        let part = |column: usize| {
-            let window = column.saturating_sub(REACH_COLUMNS)..(column + REACH_COLUMNS + 1).min(columns);
-            let common = window.end.min(other.end).saturating_sub(window.start.max(other.start));
-            common as f64 / window.len() as f64
-        };
-        self.groups[group].clone().map(part).sum::<f64>() / self.groups[group].len() as f64
+    /// The share that each column's pixels have in the mean response of each group, `[group, column]`: responses are
+    /// averaged over neighbouring columns before they are averaged over a group.
+    pub(super) fn averaged_from(&self) -> Array2<f64> {
+        let mut shares = Array2::zeros((self.groups.len(), self.lit.ncols()));
+        for (mut shares, group) in shares.outer_iter_mut().zip(&self.groups) {
+            for near in group.clone().map(|column| near_columns(column, self.lit.ncols())) {
+                let part = 1.0 / (near.len() * group.len()) as f64;
+                shares.slice_mut(s![near]).map_inplace(|share| *share += part);
+            }
+        }
+        shares
     }
 
-    /// Standard deviation of the mean of a cell's pixels in one of the pictures of its response, as a share of its light.
-    pub(super) fn picture_sd(&self, row: usize, group: usize, picture: usize) -> f64 {
-        self.picture_variances[[row * self.groups.len() + group, picture]].sqrt()
+    /// Image columns of a group.
+    pub(super) fn columns_of(&self, group: usize) -> Range<usize> {
+        self.groups[group].clone()
+    }
+
+    /// Variance of a cell's pixels in one of the pictures of its response, in squares of its light.
+    pub(super) fn picture_variance(&self, row: usize, group: usize, picture: usize) -> f64 {
+        self.picture_variances[[row * self.groups.len() + group, picture]]
     }
 }
 

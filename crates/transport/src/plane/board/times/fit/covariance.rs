@@ -1,6 +1,7 @@
 //! What the fit states of its errors.
 
 use nalgebra::{DMatrix, DVector};
+use ndarray::s;
 
 use super::super::super::images::{PICTURES, REACH_ROWS};
 use super::super::error::TimesError;
@@ -121,24 +122,28 @@ impl Fit<'_> {
     fn scatter_of_responses(&self, samples: &Samples, groups: usize) -> DMatrix<f64> {
         let rows = self.columns.rows();
         let near = |row: usize| row.saturating_sub(REACH_ROWS)..(row + REACH_ROWS + 1).min(rows);
-        let averaged =
-            DMatrix::from_fn(groups, groups, |group, other| self.columns.averaged_from(group, other));
+        // What pixels of variance 1 in the columns of one group add to the covariance of all groups' responses.
+        let shares = self.columns.averaged_from();
+        let common = |group: usize| {
+            let shares = shares.slice(s![.., self.columns.columns_of(group)]);
+            let common = shares.dot(&shares.t());
+            DMatrix::from_fn(groups, groups, |a, b| common[[a, b]])
+        };
+        let common: Vec<DMatrix<f64>> = (0..groups).map(common).collect();
         let mut scatter = DMatrix::zeros(self.unknowns.len(), self.unknowns.len());
         for picture in 0..PICTURES {
             let of_responses = samples.scores(groups, picture);
-            let mut of_pixels = DMatrix::zeros(self.unknowns.len(), rows * groups);
             for row in 0..rows {
                 let mut sum = DMatrix::zeros(self.unknowns.len(), groups);
                 for other in near(row) {
                     sum += of_responses.columns(other * groups, groups) / near(other).len() as f64;
                 }
-                let mut of_pixels = of_pixels.columns_mut(row * groups, groups);
-                of_pixels.gemm(1.0, &sum, &averaged, 0.0);
-                for (group, mut score) in of_pixels.column_iter_mut().enumerate() {
-                    score *= self.columns.picture_sd(row, group, picture);
+                let mut covariance = DMatrix::zeros(groups, groups);
+                for (group, common) in common.iter().enumerate() {
+                    covariance += common * self.columns.picture_variance(row, group, picture);
                 }
+                scatter += &sum * covariance * sum.transpose();
             }
-            scatter += &of_pixels * of_pixels.transpose();
         }
         scatter
     }
