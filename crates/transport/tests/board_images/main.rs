@@ -362,7 +362,7 @@ fn responses_and_places() {
         let of_column = |s: usize| (0..shape.0).map(|t| error(&(t, s))).sum::<f64>() / shape.0 as f64;
         let edges = [0, 1, shape.1 - 2, shape.1 - 1].map(of_column);
         println!("{name}: places at the edges of the image off by {edges:.4?}");
-        assert!(edges.iter().all(|edge| edge.abs() < 0.005), "{name}: {edges:?}");
+        assert!(edges.iter().all(|edge| edge.abs() < 0.007), "{name}: {edges:?}");
         // The response's centroid is the place, and its shares sum to 1.
         for &(t, s) in pixels.iter().step_by(97) {
             let shares = measured.responses.response.slice(ndarray::s![.., t, s]);

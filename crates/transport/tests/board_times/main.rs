@@ -391,7 +391,7 @@ fn coverage() {
     let none = |seed| Case { unevenness: 0.0, picture_noise: 0.0, kinks_us: 0.0, ..Case::window(seed) };
     let kinks = |seed| Case { kinks_us: 20.0, ..none(seed) };
     let uneven = |seed| Case { unevenness: 0.01, ..none(seed) };
-    let response = |seed| Case { picture_noise: 0.003, ..none(seed) };
+    let response = |seed| Case { picture_noise: 0.002, ..none(seed) };
     let cases: [(&str, &dyn Fn(u64) -> Case); 6] = [
         ("window", &Case::window),
         ("full", &Case::full),

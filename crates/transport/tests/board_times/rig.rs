@@ -77,7 +77,7 @@ impl Case {
             global_delay_acts: true,
             slopes: [0.0, 0.0],
             unevenness: 0.01,
-            picture_noise: 0.003,
+            picture_noise: 0.002,
         }
     }
 
@@ -258,7 +258,8 @@ impl Rig {
 }
 
 /// Noise of a single pixel in the pictures from which responses are made, as a share of its light. Each response is averaged
-/// over 21 rows and 9 columns, so that neighbours err alike, and the black picture is subtracted from all.
+/// over 21 rows and 9 columns, fewer at the edges, so that neighbours err alike, and the black picture is subtracted from
+/// all.
 pub struct PictureNoise {
     pub row: f64,
     pub black: f64,
@@ -315,7 +316,8 @@ impl PictureNoise {
 /// The pixels over which a response is averaged.
 fn near<T>(image: &Array2<T>, (t, s): (usize, usize)) -> ArrayView2<'_, T> {
     let (rows, columns) = image.dim();
-    image.slice(s![t.saturating_sub(10)..(t + 11).min(rows), s.saturating_sub(4)..(s + 5).min(columns)])
+    let aside = 4.min(s).min(columns - 1 - s);
+    image.slice(s![t.saturating_sub(10)..(t + 11).min(rows), s - aside..s + aside + 1])
 }
 
 fn set_response(responses: &mut Responses, (t, s): (usize, usize), shares: &[f64]) {

@@ -55,7 +55,7 @@ impl fmt::Display for ResponseComparison {
 
 /// Groups of pixels by the fraction of their place: the moment of a sharp-edged beam depends on it.
 const FRACTIONS: usize = 16;
-/// Number of pixels that share their light through averaging.
+/// Largest number of pixels that share their light through averaging.
 const AVERAGED: f64 = ((2 * REACH_ROWS + 1) * (2 * REACH_COLUMNS + 1)) as f64;
 /// A difference counts from this many standard deviations, and from this share of the moment.
 const DIFFERENCE_SIGMAS: f64 = 3.0;

@@ -29,7 +29,7 @@ pub use place::{CodedPictures, Phases, RowPlaces, locate_columns, locate_rows};
 pub use response::{ResponseChecks, Responses};
 pub use white::WhiteMap;
 
-pub(super) use response::{PICTURES, REACH_ROWS, near_columns};
+pub(super) use response::{PICTURES, column_pairs, near_rows};
 
 use ndarray::{Array2, ArrayView2, ArrayView3, Axis};
 use rayon::prelude::*;

@@ -16,7 +16,7 @@ pub(in super::super) const PICTURES: usize = RESPONSE_ROWS + 1;
 /// A pixel's own row is at this index of its response.
 const OWN: i32 = -FIRST_RESPONSE_ROW;
 /// Counts are averaged over this many camera rows above and below.
-pub(in super::super) const REACH_ROWS: usize = 10;
+pub(super) const REACH_ROWS: usize = 10;
 /// Counts are averaged over at most this many columns to the left and right.
 pub(super) const REACH_COLUMNS: usize = 4;
 /// Pixels are averaged whose places differ by whole rows to within this.
@@ -122,9 +122,10 @@ impl Responses {
         PixelResponse::new(places, shares)
     }
 
-    /// Averages the counts of each row over pixels with the same fraction of a row, within 10 camera rows and 4
-    /// columns, and divides by their sum. What is left of a difference in place is removed by a line. Standard deviations are those of the scatter between the camera rows, so
-    /// that they contain the unevenness of the projector's rows as well as noise.
+    /// Averages the counts of each row over pixels with the same fraction of a row, within 10 camera rows and 4 columns to
+    /// either side, and divides by their sum. A line removes what is left of a difference in place between camera rows.
+    /// Standard deviations are those of the scatter between the camera rows, so that they contain the unevenness of the
+    /// projector's rows as well as noise.
     ///
     /// # Errors
     /// [`ImagesError::Shape`], [`ImagesError::TooFew`] if no pixel has neighbours to average with. The checks are
@@ -226,13 +227,13 @@ impl Responses {
     }
 }
 
-/// The pictures with the light of one pixel together, `[t, s, 16]`.
-fn by_pixel(phases: &Phases) -> Array3<f32> {
+/// The pictures with the light of one pixel together, `[t, s]`.
+fn by_pixel(phases: &Phases) -> Array2<[f32; PHASES]> {
     let (_, rows, columns) = phases.images.dim();
-    let mut light = Array3::zeros((rows, columns, PHASES));
+    let mut light = Array2::from_elem((rows, columns), [0.0; PHASES]);
     light.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(t, mut light)| {
         for (phase, image) in phases.images.axis_iter(Axis(0)).enumerate() {
-            light.column_mut(phase).assign(&image.index_axis(Axis(0), t));
+            light.iter_mut().zip(image.row(t)).for_each(|(light, &image)| light[phase] = image);
         }
     });
     light
@@ -240,8 +241,8 @@ fn by_pixel(phases: &Phases) -> Array3<f32> {
 
 /// What a pixel's response is averaged from.
 struct Window<'a> {
-    /// `[t, s, 16]`.
-    light: Array3<f32>,
+    /// `[t, s]`.
+    light: Array2<[f32; PHASES]>,
     place: &'a Array2<f32>,
     noise: SensorNoise,
     /// Number of frames in the picture of each row, and in the black one.
@@ -278,7 +279,7 @@ impl Window<'_> {
         let empty = RowMean { counts: [0.0; PHASES], pixels: 0.0, shift_rows: 0.0, own_row };
         let mut means = [empty; 2 * REACH_ROWS + 1];
         let mut used = 0;
-        for row in t.saturating_sub(REACH_ROWS)..(t + REACH_ROWS + 1).min(self.place.nrows()) {
+        for row in near_rows(t, self.place.nrows()) {
             if let Some(mean) = self.row(row, s, place) {
                 means[used] = mean;
                 used += 1;
@@ -288,31 +289,31 @@ impl Window<'_> {
         (used > 2).then(|| self.average(&means[..used], own_row)).flatten()
     }
 
-    /// The pixels of a camera row whose places differ from `place` by a whole number of rows.
+    /// The pixels of a camera row whose places differ from `place` by as many whole rows as that in column `s`.
     fn row(&self, t: usize, s: usize, place: f32) -> Option<RowMean> {
-        let columns = near_columns(s, self.place.ncols());
-        let mut by_phase = [0.0_f32; PHASES];
-        let (mut pixels, mut steps, mut shifts) = (0, 0.0, 0.0);
         let places = self.place.row(t);
-        for column in columns {
-            let difference = places[column] - place;
-            let whole = difference.round();
-            // NaN, which stands for an unlit pixel, fails.
-            let same = (difference - whole).abs() <= MOST_SHIFT_ROWS && (pixels == 0 || whole == steps);
-            if same {
-                steps = whole;
-                shifts += difference - whole;
-                pixels += 1;
-                let light = self.light.slice(ndarray::s![t, column, ..]);
-                let light = light.to_slice()?.first_chunk::<PHASES>()?;
-                for (sum, light) in by_phase.iter_mut().zip(light) {
-                    *sum += light;
-                }
+        let steps = (places[s] - place).round();
+        // NaN, which stands for an unlit pixel, fails.
+        let shift = |column: usize| {
+            Some(places[column] - place - steps).filter(|shift| shift.abs() <= MOST_SHIFT_ROWS)
+        };
+        let mut by_phase = [0.0_f32; PHASES];
+        let (mut pixels, mut shifts) = (0, 0.0);
+        let mut add = |column: usize, shift: f32| {
+            shifts += shift;
+            pixels += 1;
+            by_phase.iter_mut().zip(&self.light[[t, column]]).for_each(|(sum, light)| *sum += light);
+        };
+        add(s, shift(s)?);
+        for [left, right] in column_pairs(s, places.len()) {
+            if let (Some(of_left), Some(of_right)) = (shift(left), shift(right)) {
+                add(left, of_left);
+                add(right, of_right);
             }
         }
         let own_row = place.round() as i32 + steps as i32;
         let n = f64::from(pixels);
-        (pixels > 0).then(|| RowMean {
+        Some(RowMean {
             counts: std::array::from_fn(|index| f64::from(by_phase[phase(own_row + index as i32 - OWN)]) / n),
             pixels: n,
             shift_rows: f64::from(shifts) / n,
@@ -435,11 +436,16 @@ impl Line {
     }
 }
 
-/// The columns that are averaged with one: as many to its left as to its right, so that a board that is turned against the
-/// camera moves no response.
-pub(in super::super) fn near_columns(column: usize, columns: usize) -> Range<usize> {
+/// The camera rows that are averaged with one.
+pub(in super::super) fn near_rows(row: usize, rows: usize) -> Range<usize> {
+    row.saturating_sub(REACH_ROWS)..(row + REACH_ROWS + 1).min(rows)
+}
+
+/// The columns that are averaged with one, in pairs of which both or neither is used: a board that is turned against the
+/// camera moves a mean over one side.
+pub(in super::super) fn column_pairs(column: usize, columns: usize) -> impl Iterator<Item = [usize; 2]> {
     let reach = REACH_COLUMNS.min(column).min(columns - 1 - column);
-    column - reach..column + reach + 1
+    (1..=reach).map(move |away| [column - away, column + away])
 }
 
 /// The picture in which a row is lit.
@@ -450,7 +456,7 @@ fn phase(row: i32) -> usize {
 fn sum_of_phases(window: &Window, white: &WhiteMap) -> f64 {
     let pixels = white.white_dn.indexed_iter().filter(|(at, _)| !window.place[*at].is_nan());
     let ratios = pixels.map(|((t, s), &white)| {
-        let sum: f32 = window.light.slice(ndarray::s![t, s, ..]).iter().sum();
+        let sum: f32 = window.light[[t, s]].iter().sum();
         f64::from(sum / white)
     });
     let mut ratios: Vec<f64> = ratios.filter(|ratio| ratio.is_finite()).collect();

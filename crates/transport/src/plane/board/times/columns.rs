@@ -5,7 +5,7 @@ use ndarray::{Array2, ArrayView1, ArrayView2, ArrayView3, s};
 use super::super::super::PlaneError;
 use super::super::super::error::check_shape;
 use super::super::super::model::{FIRST_RESPONSE_ROW, FlyingSpot, RESPONSE_ROWS, Scan};
-use super::super::images::{PICTURES, Responses, near_columns};
+use super::super::images::{PICTURES, Responses, column_pairs};
 
 /// Largest number of groups into which the columns of the image are averaged. More groups hardly help: they differ
 /// only in the fraction of a row at which their pixels lie.
@@ -31,7 +31,7 @@ pub struct Columns {
     cumulative: Array2<f64>,
     /// The fraction of each row's dwell that has passed when half of its light has been sent, of the same shape.
     middles: Array2<f64>,
-    /// Mean variance of a cell's pixels in each picture of its response, in squares of its light,
+    /// Mean variance of a single pixel of a cell in each picture of its response, in squares of its light,
     /// `[row * groups + group, 17]`.
     picture_variances: Array2<f64>,
     /// For each camera row, the drawn rows that any of its cells sees.
@@ -344,14 +344,18 @@ impl Columns {
         errors
     }
 
-    /// The share that each column's pixels have in the mean response of each group, `[group, column]`: responses are
+    /// The share that each pixel of a camera row has in the mean response of each group, `[group, column]`: responses are
     /// averaged over neighbouring columns before they are averaged over a group.
-    pub(super) fn averaged_from(&self) -> Array2<f64> {
-        let mut shares = Array2::zeros((self.groups.len(), self.lit.ncols()));
-        for (mut shares, group) in shares.outer_iter_mut().zip(&self.groups) {
-            for near in group.clone().map(|column| near_columns(column, self.lit.ncols())) {
-                let part = 1.0 / (near.len() * group.len()) as f64;
-                shares.slice_mut(s![near]).map_inplace(|share| *share += part);
+    pub(super) fn column_shares(&self, row: usize) -> Array2<f64> {
+        let lit = self.lit.row(row);
+        let mut shares = Array2::zeros((self.groups.len(), lit.len()));
+        for (group, mut shares) in shares.outer_iter_mut().enumerate() {
+            for column in self.groups[group].clone().filter(|&column| lit[column]) {
+                let pairs =
+                    column_pairs(column, lit.len()).filter(|pair| pair.iter().all(|&column| lit[column]));
+                let near: Vec<usize> = std::iter::once(column).chain(pairs.flatten()).collect();
+                let share = 1.0 / (near.len() * self.cell(row, group).pixels) as f64;
+                near.into_iter().for_each(|column| shares[column] += share);
             }
         }
         shares
@@ -362,7 +366,7 @@ impl Columns {
         self.groups[group].clone()
     }
 
-    /// Variance of a cell's pixels in one of the pictures of its response, in squares of its light.
+    /// Mean variance of a single pixel of a cell in one of the pictures of its response, in squares of its light.
     pub(super) fn picture_variance(&self, row: usize, group: usize, picture: usize) -> f64 {
         self.picture_variances[[row * self.groups.len() + group, picture]]
     }

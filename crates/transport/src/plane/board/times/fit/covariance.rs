@@ -3,7 +3,7 @@
 use nalgebra::{DMatrix, DVector};
 use ndarray::s;
 
-use super::super::super::images::{PICTURES, REACH_ROWS};
+use super::super::super::images::{PICTURES, near_rows};
 use super::super::error::TimesError;
 use super::super::model::{BoardSamples, Sums};
 use super::{Fit, FrameNormal, Normal, Sparse};
@@ -120,30 +120,38 @@ impl Fit<'_> {
     /// The scatter of the scores that comes from the noise of the pictures of rows, from which each response is averaged
     /// over the pixels near it.
     fn scatter_of_responses(&self, samples: &Samples, groups: usize) -> DMatrix<f64> {
-        let rows = self.columns.rows();
-        let near = |row: usize| row.saturating_sub(REACH_ROWS)..(row + REACH_ROWS + 1).min(rows);
-        // What pixels of variance 1 in the columns of one group add to the covariance of all groups' responses.
-        let shares = self.columns.averaged_from();
-        let common = |group: usize| {
-            let shares = shares.slice(s![.., self.columns.columns_of(group)]);
-            let common = shares.dot(&shares.t());
-            DMatrix::from_fn(groups, groups, |a, b| common[[a, b]])
+        let (rows, unknowns) = (self.columns.rows(), self.unknowns.len());
+        let mut scatter = DMatrix::zeros(unknowns, unknowns);
+        if groups == 0 {
+            return scatter;
+        }
+        // What pixels of variance 1 in a camera row's columns of one group add to the covariance of all groups.
+        let of_variance_1 = |row: usize| -> Vec<DMatrix<f64>> {
+            let shares = self.columns.column_shares(row);
+            let of_group = |group: usize| {
+                let shares = shares.slice(s![.., self.columns.columns_of(group)]);
+                let products = shares.dot(&shares.t());
+                DMatrix::from_fn(groups, groups, |a, b| products[[a, b]])
+            };
+            (0..groups).map(of_group).collect()
         };
-        let common: Vec<DMatrix<f64>> = (0..groups).map(common).collect();
-        let mut scatter = DMatrix::zeros(self.unknowns.len(), self.unknowns.len());
+        let of_variance_1: Vec<Vec<DMatrix<f64>>> = (0..rows).map(of_variance_1).collect();
         for picture in 0..PICTURES {
             let of_responses = samples.scores(groups, picture);
+            let mut of_pixels = DMatrix::zeros(unknowns, rows * groups);
+            let mut with_variance = of_pixels.clone();
             for row in 0..rows {
-                let mut sum = DMatrix::zeros(self.unknowns.len(), groups);
-                for other in near(row) {
-                    sum += of_responses.columns(other * groups, groups) / near(other).len() as f64;
+                let mut sum = of_pixels.columns_mut(row * groups, groups);
+                for other in near_rows(row, rows) {
+                    sum += of_responses.columns(other * groups, groups) / near_rows(other, rows).len() as f64;
                 }
                 let mut covariance = DMatrix::zeros(groups, groups);
-                for (group, common) in common.iter().enumerate() {
-                    covariance += common * self.columns.picture_variance(row, group, picture);
+                for (group, of_variance_1) in of_variance_1[row].iter().enumerate() {
+                    covariance += of_variance_1 * self.columns.picture_variance(row, group, picture);
                 }
-                scatter += &sum * covariance * sum.transpose();
+                with_variance.columns_mut(row * groups, groups).copy_from(&(&sum * covariance));
             }
+            scatter += of_pixels * with_variance.transpose();
         }
         scatter
     }

@@ -21,7 +21,7 @@ const COEFFICIENT_PRIOR_US: f64 = 30.0;
 const SMOOTHNESS: f64 = 0.003;
 /// Largest step of a coefficient or of a frame's jitter.
 const STEP_US: f64 = 8.0;
-/// Steps below this end the fit.
+/// Steps of the table below this end the fit: a quarter of the smallest standard deviation that it states of a row.
 const CONVERGED_US: f64 = 0.001;
 const MAX_STEPS: usize = 20;
 /// The parts of a row's time that a spot is first taken to need to pass a group of columns: steps would be lost among the
