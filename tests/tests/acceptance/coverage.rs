@@ -129,12 +129,16 @@ fn print_calibrations(calibrations: &[Errors]) {
     }
 }
 
+/// A number from the environment.
+fn number(name: &str, usual: u64) -> u64 {
+    std::env::var(name).map_or(usual, |given| given.parse().unwrap())
+}
+
 /// `RUNS` calibrations (400) from seed `FIRST` (1) on: prints shares within one standard deviation, of which 68 % would be
 /// right.
 #[test]
 #[ignore = "hours"]
 fn what_calibrations_state_covers() {
-    let number = |name: &str, usual: u64| std::env::var(name).map_or(usual, |given| given.parse().unwrap());
     let (first, runs) = (number("FIRST", 1), number("RUNS", 400));
     let unknown = UNKNOWN.replace("JITTER", "5.0");
     let scene = raysweep_tests::data("p2r_corner.npz");
@@ -147,19 +151,19 @@ fn what_calibrations_state_covers() {
     print_calibrations(&(first..first + runs).map(of_seed).collect::<Vec<_>>());
 }
 
-/// `RUNS` pairs of a calibration and a run (50), of `PLAN` `sweep` or `edges`: prints shares within one standard
-/// deviation, of which 68 % would be right, and of biases within what is stated of them.
+/// `RUNS` pairs of a calibration and a run (50) from seed `FIRST` (1) on, of `PLAN` `sweep` or `edges`: prints shares within
+/// one standard deviation, of which 68 % would be right, and of biases within what is stated of them.
 #[test]
 #[ignore = "an hour"]
 fn what_is_stated_covers() {
-    let runs: u64 = std::env::var("RUNS").map_or(50, |runs| runs.parse().unwrap());
+    let (first, runs) = (number("FIRST", 1), number("RUNS", 50));
     let plan = if std::env::var("PLAN").is_ok_and(|plan| plan == "edges") { EDGES } else { SWEEP };
     let scene = std::env::var_os("SCENE")
         .map_or_else(|| raysweep_tests::data("p2r_corner.npz"), std::path::PathBuf::from);
     let mut calibrations: Vec<Errors> = Vec::new();
     let mut pairs = Vec::new();
     let mut truths = Vec::new();
-    for seed in 1..=runs {
+    for seed in first..first + runs {
         let unknown = UNKNOWN.replace("JITTER", "5.0");
         let (bench, rig, found) = calibrated(&scene, &format!("seed = {seed}\n{unknown}"));
         let sim = rig.simulated().unwrap();

@@ -386,3 +386,72 @@ fn pixel_response(response: ArrayView1<f32>) -> Result<[f64; RESPONSE_ROWS], Pla
         }),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::super::Estimate;
+    use super::super::super::images::{Phases, RowPlaces, SensorNoise, WhiteMap};
+    use super::*;
+
+    const ROWS: usize = 25;
+    /// A camera row that has all 21 rows over which responses are averaged.
+    const ROW: usize = 12;
+    const WHITE_DN: f32 = 1000.0;
+
+    /// Responses of a board that is unlit in some columns, one pixel of which sees `more` of its light from its own row.
+    fn responses(columns: usize, unlit: &[usize], (bright, more): (usize, f32)) -> Responses {
+        let is_lit = |s: usize| !unlit.contains(&s);
+        let place = Array2::from_shape_fn((ROWS, columns), |(t, s)| match is_lit(s) {
+            true => 100.0 + t as f32,
+            false => f32::NAN,
+        });
+        let mut images = ndarray::Array3::zeros((16, ROWS, columns));
+        for (t, s) in ndarray::indices((ROWS, columns)).into_iter().filter(|&(_, s)| is_lit(s)) {
+            for (d, share) in [(0, 0.25), (1, 0.5), (2, 0.25)] {
+                images[[(99 + t + d) % 16, t, s]] = share * WHITE_DN;
+            }
+        }
+        images[[(100 + ROW) % 16, ROW, bright]] += more * WHITE_DN;
+        let white = WhiteMap {
+            white_dn: Array2::from_elem((ROWS, columns), WHITE_DN),
+            sd_dn: Array2::zeros((ROWS, columns)),
+            noise: SensorNoise { electrons_per_dn: 1.0, read_noise_e: 1.0 },
+            black_frames: 1,
+            level_dn: Estimate { value: f64::from(WHITE_DN), sd: 0.0 },
+            coverage: 1.0,
+            saturated: 0.0,
+        };
+        let places = RowPlaces { place, rms: 0.0, misread: 0.0 };
+        Responses::new(&Phases { images: images.view(), frames: 1 }, &white, &places, 720).unwrap()
+    }
+
+    #[test]
+    fn shares_of_columns_are_those_with_which_responses_are_averaged() {
+        const MORE: f32 = 0.1;
+        let own = (-FIRST_RESPONSE_ROW) as usize;
+        for (columns, unlit) in
+            [(1, &[][..]), (2, &[]), (13, &[]), (13, &[0, 1, 6]), (40, &[]), (40, &[3, 11, 12, 39])]
+        {
+            let plain = responses(columns, unlit, (0, 0.0));
+            let groups = Columns::new(plain.place.view(), plain.response.view(), None).unwrap();
+            let shares = groups.column_shares(ROW);
+            for bright in (0..columns).filter(|s| !unlit.contains(s)) {
+                let changed = responses(columns, unlit, (bright, MORE));
+                for group in (0..groups.groups()).filter(|&group| groups.cell(ROW, group).pixels > 0) {
+                    let lit = groups.columns_of(group).filter(|s| !unlit.contains(s));
+                    let sum: f32 =
+                        lit.map(|s| changed.response[[own, ROW, s]] - plain.response[[own, ROW, s]]).sum();
+                    // The mean over 21 rows; half of what one row's share gains is lost when they are made to sum to 1.
+                    let share = f64::from(sum / MORE * 21.0 / 0.5) / groups.cell(ROW, group).pixels as f64;
+                    let stated = shares[[group, bright]];
+                    assert!(
+                        (share - stated).abs() < 0.01 * stated + 1e-3,
+                        "{columns} {unlit:?} {group} {bright}: {share} {stated}"
+                    );
+                }
+            }
+            let lit = shares.rows().into_iter().map(|shares| shares.sum()).filter(|sum| *sum > 0.0);
+            assert!(lit.into_iter().all(|sum| (sum - 1.0).abs() < 1e-12), "{columns} {unlit:?}");
+        }
+    }
+}
