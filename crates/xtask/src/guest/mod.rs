@@ -8,6 +8,7 @@
 
 mod initramfs;
 mod kernel;
+mod pipe;
 mod qemu;
 mod report;
 mod script;

@@ -5,6 +5,7 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
 use super::kernel::GuestKernel;
+use super::pipe::pipe;
 use super::table::GuestTest;
 use crate::run::Done;
 
@@ -44,12 +45,14 @@ impl Machine {
         mount(&mut qemu, "modules", &kernel.modules, ",readonly=on");
         mount(&mut qemu, "share", Path::new("."), "");
         qemu.args(clock.arguments()).args(["-device", "qemu-xhci,id=usb", "-device", "virtio-serial-pci"]);
-        pipe(&mut qemu, "qmp");
+        pipe(&mut qemu, "qmp")?;
         qemu.args(["-mon", "chardev=qmp,mode=control"]);
         // Tests may share pipes and devices.
         let pipes: BTreeSet<&str> = tests.iter().flat_map(|test| test.pipes).copied().collect();
         let devices: BTreeSet<&str> = tests.iter().flat_map(|test| test.devices).copied().collect();
-        pipes.iter().for_each(|name| pipe(&mut qemu, name));
+        for name in pipes {
+            pipe(&mut qemu, name)?;
+        }
         devices.iter().for_each(|device| {
             qemu.args(["-device", device]);
         });
@@ -104,12 +107,4 @@ pub fn mount(qemu: &mut Command, tag: &str, path: &Path, options: &str) {
         &format!("local,id={tag},path={path},security_model=none,multidevs=remap{options}"),
     ]);
     qemu.args(["-device", &format!("virtio-9p-pci,fsdev={tag},mount_tag={tag}")]);
-}
-
-/// Adds a pair of connected character devices: `name` for a device or the monitor, the other for programs in the guest.
-/// They are connected through a socket, since QEMU cannot connect two directly.
-pub fn pipe(qemu: &mut Command, name: &str) {
-    qemu.args(["-chardev", &format!("socket,id={name},path={name}.socket,server=on,wait=off")]);
-    qemu.args(["-chardev", &format!("socket,id={name}-guest,path={name}.socket")]);
-    qemu.args(["-device", &format!("virtserialport,chardev={name}-guest,name={name}")]);
 }

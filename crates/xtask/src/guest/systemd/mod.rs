@@ -277,7 +277,7 @@ impl Guest {
                 "-device",
                 "virtio-gpu-pci",
             ]);
-            super::qemu::pipe(&mut qemu, "serial");
+            super::pipe::pipe(&mut qemu, "serial")?;
             qemu.args(["-device", "usb-serial,chardev=serial,always-plugged=true"]);
         }
         Machine::spawn(qemu)
