@@ -140,7 +140,7 @@ fn mirror_conforms(rig: &DotRig) {
     let data = tempfile::tempdir().unwrap();
     let mirror = rig.open_mirror(data.path()).unwrap();
     let mut mirror = mirror.expect("[mirror] names the driver of a mirror that is there, not \"sim\"");
-    suite::mirror_conforms(&mut *mirror);
+    suite::mirror_conforms(&mut *mirror, 5_000.0);
 }
 
 fn plane_rig_conforms(rig: &Rig, terminal: Option<Terminal>) {

@@ -14,7 +14,7 @@ const FAULTS: WireFaults = WireFaults { seed: 5, garbage: 0.05, stalls: 0.0, sta
 
 /// Runs the suite; the mirror must end parked and stay dark all the time.
 fn conforms(rig: &Rig, mut mirror: impl Mirror) -> (MirrorPath, Vec<Held>) {
-    let path = mirror_conforms(&mut mirror);
+    let path = mirror_conforms(&mut mirror, 5_000.0);
     drop(mirror);
     rig.assert_parked();
     let truth = rig.pty.truth();

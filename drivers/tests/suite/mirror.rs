@@ -36,8 +36,8 @@ fn feed(mirror: &mut dyn Mirror, enough: impl Fn(&MirrorProgress) -> bool) -> Mi
 }
 
 /// Checks a parked mirror against everything that [`Mirror`] promises and leaves it parked. Returns the path, which
-/// it played [`BATCHES`] times.
-pub fn mirror_conforms(mirror: &mut dyn Mirror) -> MirrorPath {
+/// it played [`BATCHES`] times at `fastest_hz`, or at a fifth of what the controller can do.
+pub fn mirror_conforms(mirror: &mut dyn Mirror, fastest_hz: f64) -> MirrorPath {
     let capabilities = mirror.capabilities().clone();
     let limits = capabilities.limits;
     let (low_hz, high_hz) = capabilities.rate_hz.clone().into_inner();
@@ -51,7 +51,7 @@ pub fn mirror_conforms(mirror: &mut dyn Mirror) -> MirrorPath {
     mirror.park().unwrap();
 
     // Paths beyond the limits of the mirror or its controller are refused.
-    let rate_hz = (high_hz / 5.0).min(5_000.0).floor().max(low_hz);
+    let rate_hz = (high_hz / 5.0).min(fastest_hz).floor().max(low_hz);
     let amplitude_deg = limits.max_tilt.0 / 4.0;
     let wide = MirrorLimits { max_tilt: MechanicalDeg(2.0 * limits.max_tilt.0), ..limits };
     let too_wide = turn(1.2 * limits.max_tilt.0, rate_hz, &wide);
@@ -74,7 +74,7 @@ pub fn mirror_conforms(mirror: &mut dyn Mirror) -> MirrorPath {
 
     // It can be parked during a path, twice, and before a path is started; afterwards it can be used again.
     mirror.load(&path).unwrap();
-    mirror.start(1000).unwrap();
+    mirror.start(100).unwrap();
     feed(mirror, |progress| progress.played > 0);
     mirror.park().unwrap();
     mirror.park().unwrap();
