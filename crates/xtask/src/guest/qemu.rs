@@ -6,7 +6,7 @@ use std::process::{Child, Command, Stdio};
 
 use super::kernel::GuestKernel;
 use super::pipe::pipe;
-use super::table::GuestTest;
+use super::table::{GuestTest, ports};
 use crate::run::Done;
 
 /// HPET clock source: on a busy host the kernel misjudges the TSC's rate, and the guest's time then runs several times
@@ -45,14 +45,12 @@ impl Machine {
         mount(&mut qemu, "modules", &kernel.modules, ",readonly=on");
         mount(&mut qemu, "share", Path::new("."), "");
         qemu.args(clock.arguments()).args(["-device", "qemu-xhci,id=usb", "-device", "virtio-serial-pci"]);
-        pipe(&mut qemu, "qmp")?;
-        qemu.args(["-mon", "chardev=qmp,mode=control"]);
-        // Tests may share pipes and devices.
-        let pipes: BTreeSet<&str> = tests.iter().flat_map(|test| test.pipes).copied().collect();
-        let devices: BTreeSet<&str> = tests.iter().flat_map(|test| test.devices).copied().collect();
-        for name in pipes {
+        for name in ports(tests) {
             pipe(&mut qemu, name)?;
         }
+        qemu.args(["-mon", "chardev=qmp,mode=control"]);
+        // Tests may share devices.
+        let devices: BTreeSet<&str> = tests.iter().flat_map(|test| test.devices).copied().collect();
         devices.iter().for_each(|device| {
             qemu.args(["-device", device]);
         });

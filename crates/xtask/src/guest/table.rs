@@ -1,5 +1,7 @@
 //! The tests that run in the guest.
 
+use std::collections::BTreeSet;
+
 use super::qemu::GuestClock;
 
 /// An integration test and its requirements on the guest.
@@ -27,6 +29,12 @@ impl GuestTest {
             GuestClock::Host
         }
     }
+}
+
+/// Names of the ports that programs in the guest open: QEMU's monitor, and what the tests share.
+pub fn ports(tests: &[&GuestTest]) -> Vec<&'static str> {
+    let pipes: BTreeSet<&str> = tests.iter().flat_map(|test| test.pipes).copied().collect();
+    ["qmp"].into_iter().chain(pipes).collect()
 }
 
 /// To add a test, add its line here, and its modules' folder in `kernel.rs` if that is new.
