@@ -74,7 +74,7 @@ pub fn mirror_conforms(mirror: &mut dyn Mirror, fastest_hz: f64) -> MirrorPath {
 
     // It can be parked during a path, twice, and before a path is started; afterwards it can be used again.
     mirror.load(&path).unwrap();
-    mirror.start(100).unwrap();
+    mirror.start(20).unwrap();
     feed(mirror, |progress| progress.played > 0);
     mirror.park().unwrap();
     mirror.park().unwrap();
