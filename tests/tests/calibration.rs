@@ -26,7 +26,8 @@ use raysweep_transport::plane::relative_rows;
 use raysweep_transport::quality::median_profile_error;
 
 const PLAN: &str = "kind = \"calibration\"\n";
-const SWEEP: &str = "kind = \"sweep\"\n[sweep]\ndelay_us = { start = -1500, stop = 1500, count = 15 }\n\
+/// Of products, one that costs nothing.
+const SWEEP: &str = "product = [{ kind = \"regular\" }]\nkind = \"sweep\"\n[sweep]\ndelay_us = { start = -1500, stop = 1500, count = 15 }\n\
                      exposure_us = { start = 600, stop = 1200, count = 5 }\naverage = 8\n";
 /// A rig that its file does not describe.
 const UNKNOWN: &str = "[sim.projector]\nbeam = { kind = \"flat-top\", up_rows = 0.5, down_rows = 1.2 }\n\
@@ -522,7 +523,7 @@ fn wells_that_are_full_before_the_converter_are_found_and_what_fills_them_is_mar
     println!("pixels saturate from {saturation_dn} DN");
     // Black is 64, and the limit a few standard deviations of the read noise below the well.
     assert!((FULL_DN..FULL_DN + 64.0).contains(&saturation_dn), "{saturation_dn}");
-    let swept = bench.run(&format!("product = [{{ kind = \"epipolar\" }}]\n{SWEEP}"));
+    let swept = bench.run(&SWEEP.replace("regular", "epipolar"));
     assert_eq!(swept.state, "complete", "{:?}", swept.error);
     let [found, truth] = transports(&swept, rig.simulated().unwrap());
     let mask: Array2<u8> = ndarray_npy::read_npy(swept.session.join("products/epipolar_mask.npy")).unwrap();

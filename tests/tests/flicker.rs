@@ -17,8 +17,8 @@ use raysweep_tests::{Bench, Ended, corner_rig, rig_text};
 use raysweep_transport::plane::relative_rows;
 use raysweep_transport::quality::median_profile_error;
 
-/// The paper's sweep.
-const SWEEP: &str = "kind = \"sweep\"\n[sweep]\ndelay_us = { start = -1500, stop = 1500, count = 15 }\n\
+/// The paper's sweep; of products, one that costs nothing.
+const SWEEP: &str = "product = [{ kind = \"regular\" }]\nkind = \"sweep\"\n[sweep]\ndelay_us = { start = -1500, stop = 1500, count = 15 }\n\
                      exposure_us = { start = 600, stop = 1200, count = 5 }\naverage = 8\n\
                      [[stage]]\nname = \"demux\"\n";
 const STEADY: &str = "[sim.ambient]\nlevel = 0.01\n";

@@ -14,7 +14,7 @@ use raysweep_tests::{Bench, Ended, rig_text};
 use raysweep_transport::plane::relative_rows;
 use raysweep_transport::quality::relative_l2;
 
-const SWEEP: &str = "kind = \"sweep\"\n[sweep]\ndelay_us = { start = -1500, stop = 1500, count = 15 }\n\
+const SWEEP: &str = "product = [{ kind = \"epipolar\" }]\nkind = \"sweep\"\n[sweep]\ndelay_us = { start = -1500, stop = 1500, count = 15 }\n\
                      exposure_us = { start = 600, stop = 1200, count = 5 }\naverage = 8\n";
 const IDEAL: &str = "{ kind = \"ideal\" }";
 const SKEWED: &str = "{ kind = \"flat-top\", up_rows = 0.5, down_rows = 1.2 }";

@@ -88,7 +88,7 @@ impl Pty {
         grantpt(&master)?;
         unlockpt(&master)?;
         let path = ptsname_r(&master)?.into();
-        Self::start(File::from(OwnedFd::from(master)), path, run, link, faults, run_as_soon_as_awake)
+        Self::start(File::from(OwnedFd::from(master)), path, run, link, faults, Far::Terminal)
     }
 
     /// Plugs in a device at the non-blocking end of a line; a driver opens the other end at `path`.
@@ -102,8 +102,7 @@ impl Pty {
         link: SerialLink,
         faults: WireFaults,
     ) -> io::Result<Self> {
-        // No real-time priority: in a guest with one emulated processor it would starve the driver.
-        Self::start(end, path, run, link, faults, || ())
+        Self::start(end, path, run, link, faults, Far::Port)
     }
 
     fn start(
@@ -112,7 +111,7 @@ impl Pty {
         run: Run,
         link: SerialLink,
         faults: WireFaults,
-        begin: fn(),
+        far: Far,
     ) -> io::Result<Self> {
         let unplugged = Arc::new(AtomicBool::new(false));
         let mut wire = Wire {
@@ -120,12 +119,15 @@ impl Pty {
             device: run,
             link,
             faults,
+            far,
             unplugged: unplugged.clone(),
             clock: Clock::real(),
             replies: 0,
         };
         let work = move || {
-            begin();
+            if far == Far::Terminal {
+                run_as_soon_as_awake();
+            }
             wire.run();
         };
         let thread = std::thread::Builder::new().name("pty".into()).spawn(work)?;
@@ -234,11 +236,22 @@ pub fn run_as_soon_as_awake() {
     let _ = set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Min, policy);
 }
 
+/// What the controller has of the line.
+#[derive(Clone, Copy, PartialEq)]
+enum Far {
+    /// A pseudo-terminal. What the host does not read is lost, as on a real port.
+    Terminal,
+    /// A port of an emulated guest, which takes one write at a time. The controller has no real-time priority: with
+    /// one processor it would starve the driver.
+    Port,
+}
+
 struct Wire {
     end: File,
     device: Run,
     link: SerialLink,
     faults: WireFaults,
+    far: Far,
     unplugged: Arc<AtomicBool>,
     clock: Clock,
     replies: u64,
@@ -301,7 +314,10 @@ impl Wire {
             let garbage = (0..length).map(|n| (self.draw(&[3, self.replies, n]) * 256.0) as u8);
             replies.splice(0..0, garbage);
         }
-        // Replies that the host does not read are lost, as on a real port.
+        if self.far == Far::Port {
+            let mut fds = [PollFd::new(self.end.as_fd(), PollFlags::POLLOUT)];
+            let _ = poll(&mut fds, PollTimeout::from(1000_u16));
+        }
         let _ = self.end.write(replies);
         replies.clear();
     }

@@ -13,7 +13,7 @@ use raysweep::rig::Rig;
 use raysweep_processing::calibration::{KeptCalibration, ResponseOf, Scanning};
 use raysweep_session::film::TransportFilm;
 use raysweep_sim::PlaneRig;
-use raysweep_tests::{Bench, Ended, rig_text};
+use raysweep_tests::{Bench, Ended, rig_text, with_products};
 use raysweep_transport::plane::{PixelResponse, RESPONSE_ROWS, relative_rows};
 use raysweep_transport::quality::median_profile_error;
 
@@ -106,6 +106,11 @@ fn known(found: &KeptCalibration, sim: &PlaneRig, beam: &[f64; RESPONSE_ROWS]) -
     KeptCalibration::new(header, arrays).unwrap()
 }
 
+/// A sweep of which only the transport is looked at: the usual products would take as long again.
+fn sweep(bench: &Bench, plan: &str) -> Ended {
+    bench.run(&with_products(&["kind = \"regular\""], plan))
+}
+
 /// The most that the error of a calibrated rig may be, as a multiple of that of the known one.
 const MOST: f64 = 1.15;
 
@@ -140,7 +145,8 @@ fn found_and_known<const N: usize>(
 #[test]
 fn an_unknown_rig_sees_the_corner_like_a_known_one() {
     let rig = calibrated(&raysweep_tests::data("p2r_corner.npz"), &UNKNOWN.replace("JITTER", "5.0"));
-    let [(calibrated, known)] = found_and_known(&rig, |bench, sim| [error_of_sweep(&bench.run(SWEEP), sim)]);
+    let [(calibrated, known)] =
+        found_and_known(&rig, |bench, sim| [error_of_sweep(&sweep(bench, SWEEP), sim)]);
     println!("error of T: {calibrated:.4} calibrated, {known:.4} known");
     assert!(known < 0.035 && calibrated < MOST * known);
 }
@@ -168,7 +174,7 @@ fn a_flying_spot_is_found_by_the_calibration() {
             .map(|v| (found.arrays.row_starts_us[v] - starts_us[v] + late_us).abs())
             .fold(0.0, f64::max);
         let [(calibrated, known)] =
-            found_and_known(&rig, |bench, sim| [error_of_sweep(&bench.run(EDGES), sim)]);
+            found_and_known(&rig, |bench, sim| [error_of_sweep(&sweep(bench, EDGES), sim)]);
         println!(
             "{spot}: rows {worst_us:.2} us off; error of T: {calibrated:.4} calibrated, {known:.4} known"
         );
@@ -186,10 +192,10 @@ fn a_second_board_tells_the_beam_from_the_board() {
         let unknown = UNKNOWN.replace("JITTER", "0.5") + &board;
         let (alone, rig, found) = calibrated(&scene, &unknown);
         assert_eq!(found.header.light.response_of, Some(ResponseOf::BeamAndBoard));
-        let misled = error_of_sweep(&alone.run(SWEEP), rig.simulated().unwrap());
+        let misled = error_of_sweep(&sweep(&alone, SWEEP), rig.simulated().unwrap());
         let rig = calibrated_by("kind = \"calibration\"\n[calibration]\nboards = 2\n", &scene, &unknown);
         assert_eq!(rig.2.header.light.response_of, Some(ResponseOf::Beam));
-        let [(told, known)] = found_and_known(&rig, |bench, sim| [error_of_sweep(&bench.run(SWEEP), sim)]);
+        let [(told, known)] = found_and_known(&rig, |bench, sim| [error_of_sweep(&sweep(bench, SWEEP), sim)]);
         println!("{scatter_rows} rows: {misled:.4} by one board, {told:.4} by two, {known:.4} known");
         assert!(told < MOST * known && misled > told);
         // Widths add up as squares.
@@ -211,9 +217,9 @@ fn an_unknown_rig_sees_all_scenes_like_a_known_one() {
         for (jitter_us, strip) in [("5.0", ""), ("5.0", STRIP), ("0.5", "")] {
             let more = UNKNOWN.replace("JITTER", jitter_us) + strip;
             let (unaware, rig) = bench(&scene, &more);
-            let uncalibrated = error_of_sweep(&unaware.run(SWEEP), rig.simulated().unwrap());
+            let uncalibrated = error_of_sweep(&sweep(&unaware, SWEEP), rig.simulated().unwrap());
             let pairs = found_and_known(&calibrated(&scene, &more), |bench, sim| {
-                let [sweep, edges] = [SWEEP, EDGES].map(|plan| error_of_sweep(&bench.run(plan), sim));
+                let [sweep, edges] = [SWEEP, EDGES].map(|plan| error_of_sweep(&sweep(bench, plan), sim));
                 [sweep, edges, error_of_film(&bench.run(FILM), sim)]
             });
             let columns = pairs.map(|(calibrated, known)| format!("{calibrated:.4} | {known:.4}"));
@@ -251,7 +257,7 @@ fn plans_without_settings_on_rigs_of_all_kinds() {
             let more = format!("{unknown}[sim.board]\nprojector_columns = [0.1, 0.6]\n");
             let pairs = found_and_known(&calibrated(&scene, &more), |bench, sim| {
                 let film = bench.run("kind = \"film\"\n[film]\ncycles = 8\n");
-                [error_of_sweep(&bench.run("kind = \"sweep\"\n"), sim), error_of_film(&film, sim)]
+                [error_of_sweep(&sweep(bench, "kind = \"sweep\"\n"), sim), error_of_film(&film, sim)]
             });
             println!(
                 "{} | {spot} | {jitter_us} us | {}",

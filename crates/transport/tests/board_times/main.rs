@@ -364,13 +364,13 @@ fn long_exposures_for_arrivals_are_refused_or_uncertain() {
 /// The spot passes a 50th of the width at a time, and rows are as well known as those that are lit evenly.
 #[test]
 fn spots_are_recognised() {
-    for (slopes, scan) in [([1.0, 1.0], Scan::OneWay), ([1.0, -1.0], Scan::Bidirectional)] {
-        for case in [Case::full(12), Case::window(12)] {
-            let session = Session::taken(Case { slopes, columns: 48, ..case });
-            let (times, spot) = session.find_spot().unwrap().unwrap();
-            assert_eq!(spot.scan, scan);
-            check_times(&session, &times);
-        }
+    let one_way = (Case { slopes: [1.0, 1.0], ..Case::full(12) }, Scan::OneWay);
+    let bidirectional = (Case { slopes: [1.0, -1.0], ..Case::window(12) }, Scan::Bidirectional);
+    for (case, scan) in [one_way, bidirectional] {
+        let session = Session::taken(Case { columns: 48, ..case });
+        let (times, spot) = session.find_spot().unwrap().unwrap();
+        assert_eq!(spot.scan, scan);
+        check_times(&session, &times);
     }
     // Rows that are lit evenly look like neither.
     assert!(Session::taken(Case::window(13)).find_spot().unwrap().is_none());
