@@ -2,6 +2,7 @@
 //! from std it uses the small clang-sys alone, so that it builds quickly everywhere.
 
 mod bench;
+mod binaries;
 mod daemon;
 mod deb;
 mod demo;

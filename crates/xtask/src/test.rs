@@ -1,13 +1,9 @@
 //! `cargo xtask test`: all checks.
 
 use std::process::Command;
-use std::thread::available_parallelism;
 
 use crate::run::{Done, cargo, run, target};
-use crate::{guest, packages, python, rootfs};
-
-/// Tests that run at once on each core: most of them wait for the time of devices.
-const TESTS_PER_CORE: usize = 2;
+use crate::{binaries, guest, packages, python, rootfs};
 
 /// Whether to run the tests in the kernel guest.
 #[derive(Clone, Copy, PartialEq)]
@@ -28,10 +24,8 @@ pub fn test(wanted: Guest) -> Done {
     run(cargo().args(["clippy", "--workspace", "--all-targets", "--all-features", "--", "-D", "warnings"]))?;
     // A separate workspace, which nothing else compiles; in the same folder, it shares what the lints have built.
     run(cargo().args(["check", "--manifest-path", "fuzz/Cargo.toml", "--target-dir"]).arg(target()))?;
-    // All failures at once: the next look at them is half an hour away.
-    let tests = ["test", "--workspace", "--all-features", "--no-fail-fast"];
-    let at_once = TESTS_PER_CORE * available_parallelism().map_or(1, usize::from);
-    run(cargo().args(tests).env("RAYSWEEP_PYTHON", python).env("RUST_TEST_THREADS", at_once.to_string()))?;
+    binaries::run_tests(&binaries::build()?, &[("RAYSWEEP_PYTHON", &python)])?;
+    run(cargo().args(["test", "--workspace", "--all-features", "--doc", "--quiet"]))?;
     match wanted {
         Guest::Run => guest::guest(&[]),
         Guest::Skip => {

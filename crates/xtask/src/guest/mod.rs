@@ -16,11 +16,10 @@ pub mod systemd;
 mod table;
 
 use std::path::PathBuf;
-use std::process::Stdio;
 use std::time::Instant;
 
-use crate::packages;
-use crate::run::{Done, cargo, target};
+use crate::run::{Done, target};
+use crate::{binaries, packages};
 use kernel::GuestKernel;
 use qemu::GuestClock;
 use table::{GuestTest, TESTS};
@@ -83,29 +82,18 @@ struct Executable {
 /// Builds the tests by the very command of `cargo xtask test`, so that both share build artifacts: selecting single
 /// tests would resolve other features of the dependencies and build them again.
 fn build(tests: &[&GuestTest]) -> Done<Vec<Executable>> {
-    let mut build = cargo();
-    build.args([
-        "test",
-        "--workspace",
-        "--all-features",
-        "--no-run",
-        "--message-format=json-render-diagnostics",
-    ]);
-    eprintln!("building the guest's tests");
-    let output =
-        build.stderr(Stdio::inherit()).output().map_err(|error| format!("cannot start cargo: {error}"))?;
-    if !output.status.success() {
-        return Err("the guest's tests do not build; see the compiler's messages above".to_owned());
-    }
-    let messages = String::from_utf8_lossy(&output.stdout);
-    let built = |test, name, path: Option<PathBuf>, what: &str| {
-        path.map(|path| Executable { test, name, path }).ok_or_else(|| format!("cargo built no {what}"))
+    let binaries = binaries::build()?;
+    let built = |test, name, file: &str| {
+        let binary = binaries.iter().find(|binary| binary.name() == file);
+        let path =
+            binary.map(|binary| binary.path.clone()).ok_or_else(|| format!("cargo built no {file}"))?;
+        Done::Ok(Executable { test, name, path })
     };
     let mut all = Vec::new();
     for GuestTest { name: test, programs, .. } in tests {
-        all.push(built(test, "test", test_executable(&messages, test), &format!("test {test}"))?);
+        all.push(built(test, "test", test)?);
         for name in *programs {
-            all.push(built(test, name, program(&messages, name), &format!("program {name}"))?);
+            all.push(built(test, name, name)?);
         }
     }
     Ok(all)
@@ -124,42 +112,9 @@ fn build_programs(names: &[&str]) -> Done<PathBuf> {
     }
 }
 
-/// Paths of the executables in cargo's JSON messages.
-fn executables(messages: &str) -> impl Iterator<Item = PathBuf> {
-    messages
-        .lines()
-        .filter_map(|line| line.split_once("\"executable\":\"")?.1.split_once('"'))
-        .map(|(path, _)| PathBuf::from(path))
-}
-
-/// The executable of a test: named after the test, with a dash and a hash.
-fn test_executable(messages: &str, name: &str) -> Option<PathBuf> {
-    executables(messages).find(|path| {
-        let file = path.file_name().map(|file| file.to_string_lossy().into_owned()).unwrap_or_default();
-        file.rsplit_once('-').is_some_and(|(stem, _)| stem == name)
-    })
-}
-
-/// The executable of a program, which cargo builds together with the tests of its crate; it has the program's name.
-fn program(messages: &str, name: &str) -> Option<PathBuf> {
-    executables(messages).find(|path| path.file_name().is_some_and(|file| file == name))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn executables_are_found_by_their_names() {
-        let messages = r#"{"reason":"compiler-artifact","executable":null}
-{"reason":"compiler-artifact","executable":"/a/deps/guest_drm_more-0123","fresh":true}
-{"reason":"compiler-artifact","executable":"/a/deps/guest_drm-4567","fresh":true}
-{"reason":"compiler-artifact","executable":"/a/guest","fresh":true}"#;
-        assert_eq!(test_executable(messages, "guest_drm"), Some(PathBuf::from("/a/deps/guest_drm-4567")));
-        assert_eq!(test_executable(messages, "guest"), None);
-        assert_eq!(program(messages, "guest"), Some(PathBuf::from("/a/guest")));
-        assert_eq!(program(messages, "guest_drm"), None);
-    }
 
     #[test]
     fn unknown_tests_are_told_what_there_is() {
