@@ -1,17 +1,16 @@
-//! The folder of a session, and listing the sessions of a data folder.
+//! The folder of a session.
 
 use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
 use std::slice;
 
-use jiff::Timestamp;
 use jiff::tz::TimeZone;
 use raysweep_core::io_text;
 
 use crate::dots::Dots;
 use crate::film::Film;
-use crate::ledger::{self, EndState, Entry, Ledger, LedgerText, Remark, SessionEntry, State};
+use crate::ledger::{self, Entry, Ledger, LedgerText, Remark, SessionEntry, State};
 use crate::manifest::{self, FileRecord};
 use crate::products::Products;
 use crate::stack::{Contents, Stack};
@@ -214,62 +213,6 @@ impl Session {
         Ledger::open(&self.ledger_path())?.append(&Entry::Note(remark))
     }
 
-    /// Moves the session to the folder [`TRASH`] beside it, where no list shows it; returns its new folder.
-    ///
-    /// # Errors
-    /// [`Error::InUse`] during a run, [`Error::Io`] if it is there already or the file system refuses.
-    pub fn trash(&self) -> Result<PathBuf> {
-        let dir = fs::canonicalize(&self.dir).map_err(moved(&self.dir))?;
-        let trash = dir.parent().unwrap_or(&dir).join(TRASH);
-        check_trash(&trash)?;
-        self.move_to(&dir, &trash)
-    }
-
-    /// Moves a session back from the folder [`TRASH`]; returns its folder.
-    ///
-    /// # Errors
-    /// [`Error::NotASession`] if it is not in such a folder; otherwise as [`Session::trash`].
-    pub fn restore(&self) -> Result<PathBuf> {
-        if let Some(trash) =
-            self.dir.parent().filter(|parent| parent.file_name().is_some_and(|name| name == TRASH))
-        {
-            check_trash(trash)?;
-        }
-        let dir = fs::canonicalize(&self.dir).map_err(moved(&self.dir))?;
-        let trash = dir.parent().filter(|parent| parent.file_name().is_some_and(|name| name == TRASH));
-        let Some(data) = trash.and_then(Path::parent) else {
-            let why = format!("it is not in a folder {TRASH}, so there is nothing to restore");
-            return Err(Error::NotASession { path: dir, why });
-        };
-        self.move_to(&dir, data)
-    }
-
-    /// Deletes the session. Its ledger goes first, so that what is left of it after a failure is no session.
-    ///
-    /// # Errors
-    /// [`Error::InUse`] during a run, [`Error::Io`] if the file system refuses.
-    pub fn delete_for_good(self) -> Result<()> {
-        let ledger = self.ledger_path();
-        let _locked = Ledger::open_damaged(&ledger)?;
-        fs::remove_file(&ledger).map_err(Error::io("delete", &ledger))?;
-        fs::remove_dir_all(&self.dir).map_err(Error::io("delete", &self.dir))
-    }
-
-    fn move_to(&self, dir: &Path, folder: &Path) -> Result<PathBuf> {
-        // No run goes on in a folder that is moved; a damaged ledger is moved too.
-        let _locked = Ledger::open_damaged(&self.ledger_path()).map_err(|error| match error {
-            Error::Io { source, .. } if source.kind() == io::ErrorKind::NotFound => moved(dir)(source),
-            error => error,
-        })?;
-        durable::create_dir_all(folder)?;
-        let target = folder.join(dir.file_name().unwrap_or_default());
-        if target.exists() {
-            return Err(Error::io("replace", &target)(io::ErrorKind::AlreadyExists.into()));
-        }
-        fs::rename(dir, &target).map_err(moved(dir))?;
-        Ok(target)
-    }
-
     /// Opens the stack for reading and writing.
     ///
     /// # Errors
@@ -376,103 +319,6 @@ impl Session {
     }
 }
 
-/// For `map_err`: a session that is missing where it has just been seen was moved by another process.
-fn moved(dir: &Path) -> impl FnOnce(io::Error) -> Error {
-    move |error| match error.kind() {
-        io::ErrorKind::NotFound => {
-            let why = "it is not there any more; another process has already moved or deleted it";
-            Error::io("move", dir)(io::Error::new(io::ErrorKind::NotFound, why))
-        }
-        _ => Error::io("move", dir)(error),
-    }
-}
-
-/// Refuses a trash that leads elsewhere: what is moved there would leave the data folder.
-fn check_trash(trash: &Path) -> Result<()> {
-    match fs::symlink_metadata(trash) {
-        Ok(found) if !found.is_dir() => {
-            let why = "it is not a folder itself, and what is moved through it would leave the data folder: put a folder in its place";
-            Err(Error::io("use the trash", trash)(io::Error::new(io::ErrorKind::NotADirectory, why)))
-        }
-        _ => Ok(()),
-    }
-}
-
-/// The folder in a data folder to which sessions are moved that are no longer wanted. It is not a session itself, so no
-/// list shows what is in it.
-pub const TRASH: &str = ".trash";
-
-/// A session in a list of sessions.
-#[derive(Debug, Clone, PartialEq)]
-pub struct SessionSummary {
-    /// Its folder.
-    pub dir: PathBuf,
-    /// The session's name as given.
-    pub name: String,
-    /// The plan's kind.
-    pub kind: String,
-    /// Who ran it.
-    pub operator: Option<String>,
-    /// What was in front of the camera.
-    pub sample: Option<String>,
-    /// Its tags.
-    pub tags: Vec<String>,
-    /// Creation time, UTC.
-    pub created: Timestamp,
-    /// Planned points: of a sweep, cycles of a film, batches, or axes of a mirror.
-    pub points: usize,
-    /// Stored points of those planned.
-    pub stored: usize,
-    /// How its latest run ended; `None` while one is running and after a crash.
-    pub end: Option<EndState>,
-    /// Warnings of its latest run.
-    pub warnings: Vec<String>,
-}
-
-/// The sessions of a data folder.
-#[derive(Debug, Default)]
-pub struct Listing {
-    /// Sorted by folder name, and so by age.
-    pub sessions: Vec<SessionSummary>,
-    /// Folders whose ledger cannot be read, with the reason.
-    pub unreadable: Vec<(PathBuf, Error)>,
-}
-
-/// Lists the sessions in a data folder; only their ledgers are read. Folders without a ledger are not
-/// sessions.
-///
-/// # Errors
-/// [`Error::Io`] if `root` cannot be listed. Errors of single sessions are in [`Listing::unreadable`].
-pub fn list(root: &Path) -> Result<Listing> {
-    let mut dirs = fs::read_dir(root)
-        .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect::<io::Result<Vec<_>>>())
-        .map_err(Error::io("list", root))?;
-    dirs.sort();
-    let mut listing = Listing::default();
-    // A copy that is being made, or was cut off, is no session yet.
-    let is_draft = |dir: &PathBuf| dir.to_string_lossy().ends_with(durable::TEMPORARY_SUFFIX);
-    for dir in dirs.into_iter().filter(|dir| !is_draft(dir)) {
-        let Ok(session) = Session::open(&dir) else { continue };
-        match session.state() {
-            Ok(state) => listing.sessions.push(SessionSummary {
-                stored: state.stored_points(),
-                points: state.session.shape.points(),
-                end: state.end.as_ref().map(|end| end.state),
-                warnings: state.end.map_or_else(Vec::new, |end| end.warnings),
-                name: state.session.name,
-                kind: state.session.kind,
-                operator: state.session.operator,
-                sample: state.session.sample,
-                tags: state.session.tags,
-                created: state.session.created,
-                dir,
-            }),
-            Err(error) => listing.unreadable.push((dir, error)),
-        }
-    }
-    Ok(listing)
-}
-
 fn create_unused(root: &Path, name: &str) -> Result<PathBuf> {
     let mut number = 1;
     loop {
@@ -508,11 +354,12 @@ fn folder_name(name: &str) -> String {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use crate::stack::{Contents, StackShape};
 
-    fn session(name: &str) -> SessionEntry {
+    /// A session to begin with.
+    pub(crate) fn session(name: &str) -> SessionEntry {
         SessionEntry {
             format: ledger::FORMAT,
             name: name.into(),
@@ -526,21 +373,6 @@ mod tests {
             shape: StackShape { contents: Contents::Sweep { points: 4, exposures: 2 }, rows: 3, columns: 5 },
             first_row: 0,
         }
-    }
-
-    #[test]
-    fn who_moves_a_session_second_is_told_that_it_was_moved() {
-        let data = tempfile::tempdir().unwrap();
-        let (first, ledger) = Session::create(data.path(), session("s"), "plan", "rig").unwrap();
-        drop(ledger);
-        let second = Session::open(first.dir()).unwrap();
-        let trashed = Session::open(&first.trash().unwrap()).unwrap();
-        let said = second.trash().unwrap_err().to_string();
-        assert!(said.contains("already moved or deleted it"), "{said}");
-        let again = Session::open(trashed.dir()).unwrap();
-        trashed.restore().unwrap();
-        let said = again.restore().unwrap_err().to_string();
-        assert!(said.contains("already moved or deleted it"), "{said}");
     }
 
     #[test]
@@ -639,21 +471,6 @@ mod tests {
         }
         fs::create_dir(root.path().join("ledger.jsonl")).unwrap();
         assert!(matches!(Session::open(root.path()), Err(Error::NotASession { .. })));
-    }
-
-    #[test]
-    fn the_list_names_what_it_cannot_read() {
-        let root = tempfile::tempdir().unwrap();
-        let (kept, _) = Session::create(root.path(), session("a"), "", "").unwrap();
-        let (bad, _) = Session::create(root.path(), session("b"), "", "").unwrap();
-        fs::write(bad.ledger_path(), "{}\n{}\n").unwrap();
-        fs::create_dir(root.path().join("other")).unwrap();
-        let listing = list(root.path()).unwrap();
-        assert_eq!(listing.sessions.len(), 1);
-        let summary = &listing.sessions[0];
-        assert_eq!((summary.dir.as_path(), summary.points, summary.stored), (kept.dir(), 4, 0));
-        assert_eq!(listing.unreadable.len(), 1);
-        assert_eq!(listing.unreadable[0].0, bad.dir());
     }
 
     #[test]

@@ -25,16 +25,20 @@ mod folder;
 pub mod input;
 pub mod integrity;
 pub mod ledger;
+mod listing;
 pub mod manifest;
 pub mod pattern;
 pub mod products;
 pub mod report;
 pub mod stack;
 pub mod transport;
+mod trash;
 mod zarr;
 
 pub use error::{Error, Result};
-pub use folder::{Listing, Session, SessionSummary, TRASH, list};
+pub use folder::Session;
+pub use listing::{Listing, SessionSummary, list};
+pub use trash::TRASH;
 
 /// Camera rows per strip: the unit in which [`stack`] and [`transport`] are stored, and so the cheapest unit
 /// for reading and writing data that do not fit in memory.

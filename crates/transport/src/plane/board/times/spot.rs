@@ -27,7 +27,8 @@ impl RowTimes {
                 .with_errors_of(responses)?;
             Ok::<_, TimesError>(Self::fit(&columns, frames, nominal, noise).ok().map(|times| (times, spot)))
         };
-        match (fit(Scan::OneWay)?, fit(Scan::Bidirectional)?) {
+        let (one_way, bidirectional) = rayon::join(|| fit(Scan::OneWay), || fit(Scan::Bidirectional));
+        match (one_way?, bidirectional?) {
             (Some(_), Some(_)) => Err(TimesError::Direction),
             (one_way, bidirectional) => Ok(one_way.or(bidirectional)),
         }

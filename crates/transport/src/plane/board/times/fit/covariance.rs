@@ -2,11 +2,13 @@
 
 use nalgebra::{DMatrix, DVector};
 use ndarray::s;
+use rayon::prelude::*;
 
 use super::super::super::images::{PICTURES, near_rows};
 use super::super::error::TimesError;
 use super::super::model::{BoardSamples, Sums};
-use super::{Fit, FrameNormal, Normal, Sparse};
+use super::Fit;
+use super::normal::{FrameNormal, Normal, Sparse};
 
 /// Share of the variance beside offset and slope that the modes may leave unexplained.
 const MODES_REST: f64 = 0.01;
@@ -81,11 +83,13 @@ impl Fit<'_> {
         self.add_priors(&mut scatter, &mut right, free);
         let inverse = matrix.clone().cholesky().ok_or(TimesError::Undetermined)?.inverse();
         let mut covariance = &inverse * scatter * &inverse;
-        for samples in samples.rows.iter().filter(|samples| !samples.is_empty()) {
+        let change = |samples: &Vec<RowSample>| {
             let (others, score) = without_row(&matrix, &frames, samples);
-            let change = others.cholesky().map_or_else(|| &inverse * &score, |others| others.solve(&score));
-            covariance.ger(1.0, &change, &change, 1.0);
-        }
+            others.cholesky().map_or_else(|| &inverse * &score, |others| others.solve(&score))
+        };
+        let rows = samples.rows.par_iter().filter(|samples| !samples.is_empty());
+        let changes: Vec<DVector<f64>> = rows.map(change).collect();
+        changes.iter().for_each(|change| covariance.ger(1.0, change, change, 1.0));
         Ok((&covariance + covariance.transpose()) / 2.0)
     }
 

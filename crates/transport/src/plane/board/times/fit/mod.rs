@@ -1,17 +1,21 @@
+mod checks;
 mod covariance;
+mod normal;
 
 use nalgebra::{DMatrix, DVector};
+use rayon::prelude::*;
 
 use super::super::super::NoiseModel;
 use super::super::super::error::check_shape;
 use super::super::Estimate;
-use super::coarse::{Arrivals, CoarseSweep, arrivals, clocks, median};
+use super::coarse::{Arrivals, CoarseSweep, arrivals, clocks};
 use super::columns::Columns;
 use super::error::TimesError;
-use super::model::{BoardSamples, Clocks, ExposureEdge, FrameComparison, Sums, Sweep};
+use super::model::{BoardSamples, Clocks, ExposureEdge, FrameComparison, Sweep};
 use super::result::{Dropped, FrameJitter, Residual, RowTimes};
 use super::settings::{BoardFrame, ExposureMode, Nominal};
 use super::table::SplineTable;
+use normal::{FrameNormal, Normal, Sparse, add_third_differences};
 
 /// What each frame's light may be late, before it is measured.
 const JITTER_PRIOR_US: f64 = 8.0;
@@ -24,23 +28,13 @@ const STEP_US: f64 = 8.0;
 /// Steps of the table below this end the fit: a quarter of the smallest standard deviation that it states of a row.
 const CONVERGED_US: f64 = 0.001;
 const MAX_STEPS: usize = 20;
+/// Frames whose share in the normal equations is summed on one core. The same on every machine, as are the sums.
+const FRAMES_TOGETHER: usize = 16;
 /// The parts of a row's time that a spot is first taken to need to pass a group of columns: steps would be lost among the
 /// moments at which a narrow one passes.
 const BLURS: [f64; 3] = [0.25, 0.125, 0.0625];
-/// Frames whose jitter is farther from the median, in robust standard deviations, are dropped.
-const OUTLIER_SDS: f64 = 4.5;
-/// Frames whose chi^2 per sample exceeds both this value and this multiple of the median are dropped.
-const MISFIT: f64 = 9.0;
-/// A frame whose edges tell its jitter less well than this has none on the light.
-const NO_EDGE_SD_US: f64 = 2.0;
 /// Smallest jitter; smaller ones cannot be told from the noise.
 const LEAST_JITTER_US: f64 = 0.05;
-/// Limits of what is accepted.
-const MAX_CHI2_PER_SAMPLE: f64 = 3.0;
-const MAX_EXPOSURE_DIFFERENCE_US: f64 = 0.3;
-/// A difference of exposures is refused if it exceeds the limit by this many standard deviations: ten or more are
-/// judged in a calibration, and a good rig must not be refused.
-const DIFFERENCE_SDS: f64 = 5.0;
 /// What single exposures may differ from the others, while it is fixed and while it is fitted.
 const FIXED_US: f64 = 1e-4;
 const FREE_US: f64 = 20.0;
@@ -107,21 +101,6 @@ struct Fit<'a> {
     dropped: Vec<Option<Dropped>>,
     jitter_prior_us: f64,
     variance_scale: f64,
-}
-
-/// Normal equations without the jitters of frames, and what is needed to find those afterwards.
-struct Normal {
-    matrix: DMatrix<f64>,
-    right: DVector<f64>,
-    frames: Vec<FrameNormal>,
-}
-
-/// One frame's part of the normal equations.
-struct FrameNormal {
-    frame: usize,
-    mixed: DVector<f64>,
-    weight: f64,
-    right: f64,
 }
 
 impl<'a> Fit<'a> {
@@ -220,7 +199,8 @@ impl<'a> Fit<'a> {
             let longer_us = self.longer_us(frame);
             comparison.lateness_us(&self.frames[frame], longer_us, self.jitter_prior_us).value
         };
-        let late_us: Vec<(usize, f64)> = self.used().map(|frame| (frame, alone(frame))).collect();
+        let used: Vec<usize> = self.used().collect();
+        let late_us: Vec<(usize, f64)> = used.into_par_iter().map(|frame| (frame, alone(frame))).collect();
         late_us.into_iter().for_each(|(frame, late_us)| self.late_us[frame] = late_us);
     }
 
@@ -248,30 +228,44 @@ impl<'a> Fit<'a> {
         let sweep = self.sweep();
         let comparison = self.comparison(&sweep);
         let count = self.unknowns.len();
-        let mut matrix = DMatrix::zeros(count, count);
-        let mut right = DVector::zeros(count);
-        let mut frames = Vec::new();
-        for frame in self.used() {
-            let prior = self.jitter_prior_us.powi(-2);
-            let mut own = FrameNormal {
-                frame,
-                mixed: DVector::zeros(count),
-                weight: prior,
-                right: -self.late_us[frame] * prior,
+        let of_frames = |used: &[usize]| {
+            let mut normal = Normal {
+                matrix: DMatrix::zeros(count, count),
+                right: DVector::zeros(count),
+                frames: Vec::new(),
             };
-            let late = (self.late_us[frame], self.longer_us(frame));
-            comparison.visit(
-                &self.frames[frame],
-                late,
-                BoardSamples::OnEdges,
-                |row, opening, closing, sums| {
-                    let edges = self.edges(frame, row, opening, closing);
-                    own.add(&edges, sums, &mut matrix, &mut right);
-                },
-            );
-            matrix.ger(-own.weight.recip(), &own.mixed, &own.mixed, 1.0);
-            right.axpy(-own.right / own.weight, &own.mixed, 1.0);
-            frames.push(own);
+            for &frame in used {
+                let prior = self.jitter_prior_us.powi(-2);
+                let mut own = FrameNormal {
+                    frame,
+                    mixed: DVector::zeros(count),
+                    weight: prior,
+                    right: -self.late_us[frame] * prior,
+                };
+                let late = (self.late_us[frame], self.longer_us(frame));
+                comparison.visit(
+                    &self.frames[frame],
+                    late,
+                    BoardSamples::OnEdges,
+                    |row, opening, closing, sums| {
+                        let edges = self.edges(frame, row, opening, closing);
+                        own.add(&edges, sums, &mut normal.matrix, &mut normal.right);
+                    },
+                );
+                normal.matrix.ger(-own.weight.recip(), &own.mixed, &own.mixed, 1.0);
+                normal.right.axpy(-own.right / own.weight, &own.mixed, 1.0);
+                normal.frames.push(own);
+            }
+            normal
+        };
+        let used: Vec<usize> = self.used().collect();
+        let parts: Vec<Normal> = used.par_chunks(FRAMES_TOGETHER).map(of_frames).collect();
+        let (mut matrix, mut right) = (DMatrix::zeros(count, count), DVector::zeros(count));
+        let mut frames = Vec::new();
+        for part in parts {
+            matrix += part.matrix;
+            right += part.right;
+            frames.extend(part.frames);
         }
         self.add_priors(&mut matrix, &mut right, free);
         Normal { matrix, right, frames }
@@ -314,160 +308,12 @@ impl<'a> Fit<'a> {
         Ok(())
     }
 
-    /// chi^2 and number of samples of a frame.
-    fn misfit(&self, comparison: &FrameComparison, frame: usize) -> (f64, f64) {
-        let (mut chi2, mut samples) = (0.0, 0.0);
-        let late = (self.late_us[frame], self.longer_us(frame));
-        comparison.visit(&self.frames[frame], late, BoardSamples::OnEdges, |_, _, _, sums| {
-            chi2 += sums.chi2;
-            samples += sums.samples;
-        });
-        (chi2, samples)
-    }
-
     /// The frames of a shutter mode that are used, with their jitters.
     fn jitters_of(&self, shutter: ExposureMode) -> Vec<(usize, f64)> {
         self.used()
             .filter(|&frame| self.frames[frame].setting.shutter == shutter)
             .map(|frame| (frame, self.late_us[frame]))
             .collect()
-    }
-
-    fn drop_outliers(&mut self) {
-        for frame in self.used().collect::<Vec<_>>() {
-            if self.jitter_weight[frame] < NO_EDGE_SD_US.powi(-2) {
-                self.dropped[frame] = Some(Dropped::NoEdge);
-            }
-        }
-        for shutter in [ExposureMode::Global, ExposureMode::Rolling] {
-            let jitters = self.jitters_of(shutter);
-            let middle_us = median(&mut jitters.iter().map(|jitter| jitter.1).collect::<Vec<_>>());
-            let mut away_us: Vec<f64> = jitters.iter().map(|jitter| (jitter.1 - middle_us).abs()).collect();
-            let sd_us = (1.4826 * median(&mut away_us)).max(0.5);
-            for (frame, late_us) in jitters {
-                if (late_us - middle_us).abs() > OUTLIER_SDS * sd_us {
-                    self.dropped[frame] = Some(Dropped::Late { late_us: late_us - middle_us });
-                }
-            }
-        }
-        let sweep = self.sweep();
-        let comparison = self.comparison(&sweep);
-        let misfits: Vec<(usize, f64)> = self
-            .used()
-            .map(|frame| {
-                let (chi2, samples) = self.misfit(&comparison, frame);
-                (frame, chi2 / samples.max(1.0))
-            })
-            .collect();
-        let usual = median(&mut misfits.iter().map(|misfit| misfit.1).collect::<Vec<_>>());
-        for (frame, chi2_per_sample) in misfits {
-            if chi2_per_sample > MISFIT * usual.max(1.0) {
-                self.dropped[frame] = Some(Dropped::Misfit { chi2_per_sample });
-            }
-        }
-    }
-
-    /// Standard deviation of the frames' jitters about the mean of their shutter mode.
-    fn check_jitter(&self) -> Result<Estimate, TimesError> {
-        let (mut squares, mut count) = (0.0, 0.0);
-        for shutter in [ExposureMode::Global, ExposureMode::Rolling] {
-            let jitters = self.jitters_of(shutter);
-            let mean_us = jitters.iter().map(|jitter| jitter.1).sum::<f64>() / jitters.len() as f64;
-            squares += jitters.iter().map(|jitter| (jitter.1 - mean_us).powi(2)).sum::<f64>();
-            count += jitters.len() as f64 - 1.0;
-        }
-        if count < 1.0 {
-            return Err(TimesError::Undetermined);
-        }
-        let jitter_us = (squares / count).sqrt();
-        let limit_us = self.nominal.row_time_us / 2.0 + 20.0;
-        if jitter_us > limit_us {
-            return Err(TimesError::Jitter { jitter_us, limit_us });
-        }
-        Ok(Estimate { value: jitter_us, sd: jitter_us / (2.0 * count).sqrt() })
-    }
-
-    fn check_residuals(&self) -> Result<Vec<Residual>, TimesError> {
-        let sweep = self.sweep();
-        let comparison = self.comparison(&sweep);
-        let mut residuals: Vec<Residual> = Vec::new();
-        for frame in self.used() {
-            let setting = self.frames[frame].setting;
-            let (chi2, samples) = self.misfit(&comparison, frame);
-            let same = |residual: &&mut Residual| {
-                residual.shutter == setting.shutter && residual.exposure_us == setting.exposure_us
-            };
-            match residuals.iter_mut().find(same) {
-                Some(residual) => {
-                    residual.frames += 1;
-                    residual.samples += samples as usize;
-                    residual.chi2_per_sample += chi2;
-                }
-                None => residuals.push(Residual {
-                    shutter: setting.shutter,
-                    exposure_us: setting.exposure_us,
-                    frames: 1,
-                    samples: samples as usize,
-                    chi2_per_sample: chi2,
-                }),
-            }
-        }
-        for residual in &mut residuals {
-            residual.chi2_per_sample /= residual.samples.max(1) as f64;
-        }
-        let worst = residuals.iter().max_by(|a, b| a.chi2_per_sample.total_cmp(&b.chi2_per_sample));
-        match worst {
-            Some(worst) if worst.chi2_per_sample > MAX_CHI2_PER_SAMPLE => Err(TimesError::Misfit {
-                chi2_per_sample: worst.chi2_per_sample,
-                limit: MAX_CHI2_PER_SAMPLE,
-                exposure_us: worst.exposure_us,
-            }),
-            _ => Ok(residuals),
-        }
-    }
-
-    fn chi2_per_sample(&self) -> f64 {
-        let sweep = self.sweep();
-        let comparison = self.comparison(&sweep);
-        let (chi2, samples) = self
-            .used()
-            .map(|frame| self.misfit(&comparison, frame))
-            .fold((0.0, 0.0), |sums, (chi2, samples)| (sums.0 + chi2, sums.1 + samples));
-        chi2 / f64::max(samples, 1.0)
-    }
-
-    fn check_order(&self) -> Result<(), TimesError> {
-        let starts_us = self.starts_us();
-        let back = |row: &usize| starts_us[row + 1] <= starts_us[*row];
-        match self.columns.seen_rows().find(back) {
-            Some(row) => Err(TimesError::FoldsBack { row, back_us: starts_us[row] - starts_us[row + 1] }),
-            None => Ok(()),
-        }
-    }
-
-    /// Fits the length of each exposure, and refuses those that are longer than others by more than they should.
-    fn check_exposures(&self) -> Result<(), TimesError> {
-        if self.exposures_us.len() < 2 {
-            return Ok(());
-        }
-        let mut fit = self.clone();
-        fit.steps(MAX_STEPS, true)?;
-        let covariance = fit.covariance(true)?;
-        for (index, &exposure_us) in self.exposures_us.iter().enumerate().skip(1) {
-            let unknown = self.table.coefficients + 2 + index;
-            let difference_us = fit.unknowns[unknown];
-            let sd_us = covariance[(unknown, unknown)].sqrt();
-            if difference_us.abs() > MAX_EXPOSURE_DIFFERENCE_US + DIFFERENCE_SDS * sd_us {
-                return Err(TimesError::Granular {
-                    exposure_us,
-                    reference_us: self.exposures_us[0],
-                    difference_us,
-                    sd_us,
-                    limit_us: MAX_EXPOSURE_DIFFERENCE_US,
-                });
-            }
-        }
-        Ok(())
     }
 
     fn result(&self, jitter_us: Estimate, residuals: Vec<Residual>) -> Result<RowTimes, TimesError> {
@@ -538,83 +384,5 @@ impl<'a> Fit<'a> {
                 .collect(),
             seen_rows,
         })
-    }
-}
-
-impl FrameNormal {
-    /// Adds the samples of one camera row. The light is `closing` minus `opening`, and late light is an early edge.
-    fn add(
-        &mut self,
-        [opening, closing]: &[Sparse; 2],
-        sums: &Sums,
-        matrix: &mut DMatrix<f64>,
-        right: &mut DVector<f64>,
-    ) {
-        let count = right.len();
-        let matrix = matrix.as_mut_slice();
-        for &(a, x) in opening.entries() {
-            opening.entries().iter().for_each(|&(b, y)| matrix[b * count + a] += sums.opening_square * x * y);
-            for &(b, y) in closing.entries() {
-                matrix[b * count + a] -= sums.mixed * x * y;
-                matrix[a * count + b] -= sums.mixed * x * y;
-            }
-            right[a] -= sums.opening_residual * x;
-            self.mixed[a] -= (sums.opening_square - sums.mixed) * x;
-        }
-        for &(a, x) in closing.entries() {
-            closing.entries().iter().for_each(|&(b, y)| matrix[b * count + a] += sums.closing_square * x * y);
-            right[a] += sums.closing_residual * x;
-            self.mixed[a] -= (sums.closing_square - sums.mixed) * x;
-        }
-        self.weight += sums.opening_square - 2.0 * sums.mixed + sums.closing_square;
-        self.right += sums.opening_residual - sums.closing_residual;
-    }
-}
-
-/// Derivative of an edge's time, relative to the light, to the unknowns.
-#[derive(Default)]
-struct Sparse {
-    entries: [(usize, f64); 12],
-    count: usize,
-}
-
-impl Sparse {
-    fn push(&mut self, unknown: usize, value: f64) {
-        self.entries[self.count] = (unknown, value);
-        self.count += 1;
-    }
-
-    fn entries(&self) -> &[(usize, f64)] {
-        &self.entries[..self.count]
-    }
-
-    /// The light is late by the table at the place that is being drawn at the edge, not at the pixel's place.
-    fn add_table(&mut self, table: &SplineTable, edge: &ExposureEdge) {
-        for (row, share) in [(edge.row, 1.0 - edge.fraction), (edge.row + 1, edge.fraction)] {
-            let (first, weights) = table.weights(row);
-            weights.iter().enumerate().for_each(|(index, weight)| self.push(first + index, -share * weight));
-        }
-    }
-}
-
-/// Adds the squares of third differences of the coefficients, which begin at `values`, to normal equations.
-fn add_third_differences(
-    matrix: &mut DMatrix<f64>,
-    right: &mut DVector<f64>,
-    values: Option<&[f64]>,
-    weight: f64,
-) {
-    const DIFFERENCE: [f64; 4] = [-1.0, 3.0, -3.0, 1.0];
-    let count = values.map_or(matrix.nrows(), <[f64]>::len);
-    for first in 0..count - 3 {
-        let value: f64 = values.map_or(0.0, |values| {
-            DIFFERENCE.iter().zip(&values[first..]).map(|(difference, value)| difference * value).sum()
-        });
-        for (a, x) in DIFFERENCE.iter().enumerate() {
-            for (b, y) in DIFFERENCE.iter().enumerate() {
-                matrix[(first + a, first + b)] += weight * x * y;
-            }
-            right[first + a] -= weight * x * value;
-        }
     }
 }
