@@ -18,9 +18,9 @@ const TESTS_AT_ONCE: &str = "2";
 pub struct Binary {
     pub path: PathBuf,
     /// Folder of its crate, in which cargo runs tests.
-    folder: PathBuf,
+    pub folder: PathBuf,
     /// Whether it is a harness with tests rather than a program.
-    is_test: bool,
+    pub is_test: bool,
 }
 
 impl Binary {
@@ -132,11 +132,13 @@ mod tests {
     fn executables_are_found_with_their_names() {
         let messages = r#"{"reason":"compiler-artifact","manifest_path":"/p/drivers/Cargo.toml","profile":{"test":true},"executable":null}
 {"reason":"compiler-artifact","manifest_path":"/p/drivers/Cargo.toml","target":{"test":true},"profile":{"opt_level":"0","test":true},"executable":"/a/deps/guest_drm-4567","fresh":true}
-{"reason":"compiler-artifact","manifest_path":"/p/daemon/Cargo.toml","target":{"test":true},"profile":{"opt_level":"0","test":false},"executable":"/a/raysweep-sim-camera","fresh":true}"#;
+{"reason":"compiler-artifact","manifest_path":"/p/daemon/Cargo.toml","target":{"test":true},"profile":{"opt_level":"0","test":true},"executable":"/a/deps/raysweepd-89ab","fresh":true}
+{"reason":"compiler-artifact","manifest_path":"/p/daemon/Cargo.toml","target":{"test":true},"profile":{"opt_level":"0","test":false},"executable":"/a/raysweepd","fresh":true}"#;
         let found = binaries(messages);
         let names: Vec<String> = found.iter().map(Binary::name).collect();
-        assert_eq!(names, ["guest_drm", "raysweep-sim-camera"]);
-        assert_eq!((found[0].is_test, found[1].is_test), (true, false));
+        assert_eq!(names, ["guest_drm", "raysweepd", "raysweepd"]);
+        let is_test: Vec<bool> = found.iter().map(|binary| binary.is_test).collect();
+        assert_eq!(is_test, [true, true, false]);
         assert_eq!(found[0].folder, Path::new("/p/drivers"));
     }
 

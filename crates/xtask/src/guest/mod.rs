@@ -18,8 +18,9 @@ mod table;
 use std::path::PathBuf;
 use std::time::Instant;
 
+use crate::binaries::{self, Binary};
+use crate::packages;
 use crate::run::{Done, target};
-use crate::{binaries, packages};
 use kernel::GuestKernel;
 use qemu::GuestClock;
 use table::{GuestTest, TESTS};
@@ -83,20 +84,20 @@ struct Executable {
 /// tests would resolve other features of the dependencies and build them again.
 fn build(tests: &[&GuestTest]) -> Done<Vec<Executable>> {
     let binaries = binaries::build()?;
-    let built = |test, name, file: &str| {
-        let binary = binaries.iter().find(|binary| binary.name() == file);
-        let path =
-            binary.map(|binary| binary.path.clone()).ok_or_else(|| format!("cargo built no {file}"))?;
-        Done::Ok(Executable { test, name, path })
-    };
     let mut all = Vec::new();
     for GuestTest { name: test, programs, .. } in tests {
-        all.push(built(test, "test", test)?);
+        all.push(Executable { test, name: "test", path: find(&binaries, test, true)? });
         for name in *programs {
-            all.push(built(test, name, name)?);
+            all.push(Executable { test, name, path: find(&binaries, name, false)? });
         }
     }
     Ok(all)
+}
+
+/// The path of a test, or of a program, whose own unit tests have its name too.
+fn find(binaries: &[Binary], name: &str, is_test: bool) -> Done<PathBuf> {
+    let found = binaries.iter().find(|binary| binary.is_test == is_test && binary.name() == name);
+    found.map(|binary| binary.path.clone()).ok_or_else(|| format!("cargo built no {name}"))
 }
 
 /// Builds programs with the tests of the daemon, and so with what `cargo xtask test` has built; returns their folder.
@@ -115,6 +116,14 @@ fn build_programs(names: &[&str]) -> Done<PathBuf> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_program_is_not_taken_for_its_own_unit_tests() {
+        let binary = |path: &str, is_test| Binary { path: path.into(), folder: PathBuf::new(), is_test };
+        let binaries = [binary("/a/deps/raysweepd-89ab", true), binary("/a/raysweepd", false)];
+        assert_eq!(find(&binaries, "raysweepd", false), Ok(PathBuf::from("/a/raysweepd")));
+        assert!(find(&binaries, "raysweep", false).is_err());
+    }
 
     #[test]
     fn unknown_tests_are_told_what_there_is() {
