@@ -1,6 +1,7 @@
 //! `raysweepd`, the daemon that owns a rig, and `raysweep`, its client.
 
 pub mod arguments;
+mod catalogue;
 pub mod cli;
 mod computing;
 pub mod control;
@@ -12,6 +13,7 @@ pub mod mirror;
 mod plane;
 mod probes;
 mod procedure;
+mod refusals;
 pub mod rig;
 mod run;
 mod runner;

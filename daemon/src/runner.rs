@@ -7,20 +7,21 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
+use raysweep_config::Plan;
 use raysweep_config::plan::with_tables;
-use raysweep_config::{ConfigError, Plan};
 use raysweep_core::{CameraCapabilities, Size, io_text};
 use raysweep_pipeline::message_of;
-use raysweep_processing::calibration::{CalibrationHeader, KeptCalibration, current_in};
+use raysweep_processing::calibration::KeptCalibration;
 use raysweep_proto::{
     CalibrationInfo, CheckReport, DesignParams, DesignReport, DoctorParams, DoctorReport, ErrorCode, Event,
-    Mistake, ResumeParams, RpcError, RunParams, RunState, SessionInfo, Started, Status, ViewfinderParams,
+    ResumeParams, RpcError, RunParams, RunState, SessionInfo, Started, Status, ViewfinderParams,
 };
-use raysweep_session::integrity::{Audit, Damage, DamagedPart, changed_inputs};
-use raysweep_session::ledger::{EndState, Ledger, LedgerText, SessionEntry};
-use raysweep_session::{Session, SessionSummary, input};
+use raysweep_session::integrity::changed_inputs;
+use raysweep_session::ledger::{Ledger, SessionEntry};
+use raysweep_session::{Session, input};
 use tokio::sync::broadcast;
 
+use crate::catalogue::{calibrations_in, damaged_calibration, sessions_in};
 use crate::computing::Computing;
 use crate::control::Control;
 use crate::doctor::{self, PlanNeeds};
@@ -29,8 +30,9 @@ use crate::mirror;
 use crate::probes::Probes;
 use crate::procedure::lab::Lab;
 use crate::procedure::{foresee, foresee_rest};
+use crate::refusals::{NotBegun, invalid_plan, no_session, storage, wrong_state};
 use crate::rig::{AnyRig, RigError, SharedRig};
-use crate::run::board::{StatusBoard, WrongState};
+use crate::run::board::StatusBoard;
 use crate::run::life::{Foreseen, Run, conduct};
 use crate::run::look::{NoViewfinder, check_look};
 use crate::run::orders::{Order, Orders};
@@ -46,9 +48,6 @@ const MOST_PREPARING: Duration = Duration::from_millis(500);
 
 /// Longest plan or rig file of a session.
 const MOST_TEXT_BYTES: u64 = 4 << 20;
-
-/// The procedure whose sessions hold calibrations.
-const CALIBRATION: &str = "calibration";
 
 /// The daemon's core: a rig, a data folder, and at most one run.
 pub struct Runner {
@@ -552,35 +551,7 @@ impl Control for Runner {
     }
 
     fn sessions(&self) -> Result<Vec<SessionInfo>, RpcError> {
-        let listing =
-            self.computing.now(|| raysweep_session::list(&self.data)).map_err(|error| storage(&error))?;
-        let readable = listing.sessions.into_iter().map(|session| SessionInfo {
-            session: session.dir,
-            name: session.name,
-            created: session.created.to_string(),
-            stored: session.stored,
-            points: session.points,
-            state: session.end.map_or("unfinished", EndState::name).into(),
-            kind: session.kind,
-            operator: session.operator,
-            sample: session.sample,
-            tags: session.tags,
-            warnings: session.warnings,
-        });
-        let unreadable = listing.unreadable.into_iter().map(|(dir, error)| SessionInfo {
-            session: dir,
-            name: error.to_string(),
-            created: String::new(),
-            stored: 0,
-            points: 0,
-            state: "unreadable".into(),
-            kind: String::new(),
-            operator: None,
-            sample: None,
-            tags: Vec::new(),
-            warnings: Vec::new(),
-        });
-        Ok(readable.chain(unreadable).collect())
+        self.computing.now(|| sessions_in(&self.data)).map_err(|error| storage(&error))
     }
 
     fn calibrations(&self) -> Result<Vec<CalibrationInfo>, RpcError> {
@@ -623,93 +594,5 @@ impl Control for Runner {
 
     fn events(&self) -> broadcast::Receiver<Event> {
         self.board.subscribe()
-    }
-}
-
-/// The calibrations among the sessions of a data folder.
-fn calibrations_in(data: &Path) -> raysweep_session::Result<Vec<CalibrationInfo>> {
-    let listing = raysweep_session::list(data)?;
-    let in_use = CalibrationHeader::read(&current_in(data)).ok().flatten();
-    let measured = listing.sessions.into_iter().filter(|session| session.kind == CALIBRATION);
-    let info = |session: SessionSummary| {
-        let name = session.dir.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let (header, problem) = match CalibrationHeader::read(&session.dir) {
-            Ok(header @ Some(_)) => (header, None),
-            Ok(None) => (None, Some("its run did not succeed: see its report and ledger".into())),
-            Err(problem) => (None, Some(problem)),
-        };
-        CalibrationInfo {
-            session: session.dir,
-            made: header.as_ref().map_or_else(String::new, |header| header.made.to_string()),
-            camera: header.map_or_else(String::new, |header| header.valid_for.camera),
-            in_use: in_use.as_ref().is_some_and(|in_use| in_use.session == name),
-            problem,
-        }
-    };
-    Ok(measured.map(info).collect())
-}
-
-/// What of a session's calibration is damaged, if anything.
-fn damaged_calibration(session: &Session) -> raysweep_session::Result<Option<Damage>> {
-    let text = LedgerText::read(&session.ledger_path())?;
-    let state = text.replay(&session.ledger_path())?;
-    let is_of_calibration = |damage: &Damage| match &damage.part {
-        DamagedPart::Input { file } => file.starts_with("calibration."),
-        part => matches!(part, DamagedPart::Manifest),
-    };
-    Ok(Audit::without_data(session, &text, &state)?.damage.into_iter().find(is_of_calibration))
-}
-
-fn no_session(what: String) -> RpcError {
-    RpcError::new(ErrorCode::NoSession, what)
-}
-
-fn invalid_plan(error: &ConfigError) -> RpcError {
-    let mut rpc = RpcError::new(ErrorCode::InvalidPlan, error.to_string());
-    if let Some(data) = &mut rpc.data {
-        let span = |mistake: &raysweep_config::ConfigMistake| {
-            mistake.span.clone().map(|span| (span.start, span.end))
-        };
-        data.field.clone_from(&error.first().field);
-        data.span = span(error.first());
-        data.mistakes = error
-            .mistakes()
-            .map(|mistake| Mistake {
-                message: mistake.message.clone(),
-                field: mistake.field.clone(),
-                span: span(mistake),
-            })
-            .collect();
-    }
-    rpc
-}
-
-/// Why a session was not made.
-struct NotBegun(RpcError);
-
-impl From<raysweep_session::Error> for NotBegun {
-    fn from(error: raysweep_session::Error) -> Self {
-        Self(storage(&error))
-    }
-}
-
-fn storage(error: &raysweep_session::Error) -> RpcError {
-    RpcError::new(ErrorCode::Storage, error.to_string())
-}
-
-fn wrong_state(WrongState(state): WrongState) -> RpcError {
-    let what = format!("the daemon is {}: wait for the run's end, or cancel it", name_of(state));
-    RpcError::new(ErrorCode::Busy, what)
-}
-
-fn name_of(state: RunState) -> &'static str {
-    match state {
-        RunState::Idle => "idle",
-        RunState::Preparing => "preparing a run",
-        RunState::Armed => "armed",
-        RunState::Running => "running",
-        RunState::Paused => "paused",
-        RunState::Draining => "finishing a run",
-        RunState::Faulted => "faulted",
     }
 }

@@ -164,7 +164,7 @@ fn a_cable_pulled_out_within_a_path_is_told_and_the_next_driver_parks_the_mirror
     let mut lab = Lab::new();
     let mut mirror = lab.open();
     mirror.load(&batch()).unwrap();
-    mirror.start(40).unwrap();
+    mirror.start(100).unwrap();
     let lit =
         |lab: &Lab| lab.controller.look(|truth| truth.held.iter().filter(|held| held.light > 0).count());
     let began = Instant::now();

@@ -24,8 +24,10 @@ pub fn test(wanted: Guest) -> Done {
     run(cargo().args(["clippy", "--workspace", "--all-targets", "--all-features", "--", "-D", "warnings"]))?;
     // A separate workspace, which nothing else compiles; in the same folder, it shares what the lints have built.
     run(cargo().args(["check", "--manifest-path", "fuzz/Cargo.toml", "--target-dir"]).arg(target()))?;
-    binaries::run_tests(&binaries::build()?, &[("RAYSWEEP_PYTHON", &python)])?;
+    // All failures at once: the next look at them is half an hour away.
+    let tested = binaries::run_tests(&binaries::build()?, &[("RAYSWEEP_PYTHON", &python)]);
     run(cargo().args(["test", "--workspace", "--all-features", "--doc", "--quiet"]))?;
+    tested?;
     match wanted {
         Guest::Run => guest::guest(&[]),
         Guest::Skip => {

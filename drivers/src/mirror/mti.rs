@@ -16,7 +16,10 @@ use super::state::{MirrorState, Reach, Sent, StateFile};
 use crate::serial::wire::{Parsed, parse_line};
 
 const BAUD: u32 = 115_200;
-const REPLY_WAIT: Duration = Duration::from_millis(300);
+/// A controller answers within milliseconds; the rest is for the kernel's workers of a busy host, see [`Timeout`].
+///
+/// [`Timeout`]: crate::serial::timeout::Timeout
+const REPLY_WAIT: Duration = Duration::from_secs(1);
 /// Maximum wait for switching the high voltage.
 const ENABLE_WAIT: Duration = Duration::from_secs(2);
 

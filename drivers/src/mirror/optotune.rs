@@ -17,7 +17,10 @@ use crate::serial::port::Port;
 use crate::serial::wire::{Parsed, parse_line};
 
 const BAUD: u32 = 256_000;
-const REPLY_WAIT: Duration = Duration::from_millis(300);
+/// A controller answers within milliseconds; the rest is for the kernel's workers of a busy host, see [`Timeout`].
+///
+/// [`Timeout`]: crate::serial::timeout::Timeout
+const REPLY_WAIT: Duration = Duration::from_secs(1);
 /// The controller's coordinates are tan(optical angle) / tan(this angle).
 const FULL_SCALE_OPTICAL_DEG: f64 = 50.0;
 

@@ -11,6 +11,9 @@ use crate::HUNG;
 /// How often the path is played to its end.
 pub const BATCHES: u32 = 2;
 
+/// How long a path takes that is cut short: long enough for a busy host.
+const COURSE_S: f64 = 20.0;
+
 /// A dark closed path around the origin, at most 20 turns per second.
 fn turn(amplitude_deg: f64, rate_hz: f64, limits: &MirrorLimits) -> MirrorPath {
     let samples = (rate_hz / 20.0).ceil().max(100.0) as usize;
@@ -36,7 +39,7 @@ fn feed(mirror: &mut dyn Mirror, enough: impl Fn(&MirrorProgress) -> bool) -> Mi
 }
 
 /// Checks a parked mirror against everything that [`Mirror`] promises and leaves it parked. Returns the path, which
-/// it played [`BATCHES`] times at `fastest_hz`, or at a fifth of what the controller can do.
+/// it played [`BATCHES`] times, at `fastest_hz` or a fifth of what the controller can do, whichever is less.
 pub fn mirror_conforms(mirror: &mut dyn Mirror, fastest_hz: f64) -> MirrorPath {
     let capabilities = mirror.capabilities().clone();
     let limits = capabilities.limits;
@@ -74,8 +77,9 @@ pub fn mirror_conforms(mirror: &mut dyn Mirror, fastest_hz: f64) -> MirrorPath {
 
     // It can be parked during a path, twice, and before a path is started; afterwards it can be used again.
     mirror.load(&path).unwrap();
-    mirror.start(20).unwrap();
-    feed(mirror, |progress| progress.played > 0);
+    mirror.start((COURSE_S * rate_hz / path.points().len() as f64) as u32).unwrap();
+    let amid = feed(mirror, |progress| progress.played > 0);
+    assert!(!amid.parked, "{amid:?}");
     mirror.park().unwrap();
     mirror.park().unwrap();
     assert_eq!(kind(mirror.feed().map(drop)), DeviceErrorKind::NotReady);

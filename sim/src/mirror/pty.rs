@@ -88,10 +88,10 @@ impl Pty {
         grantpt(&master)?;
         unlockpt(&master)?;
         let path = ptsname_r(&master)?.into();
-        Self::start(File::from(OwnedFd::from(master)), path, run, link, faults, Far::Terminal)
+        Self::start(File::from(OwnedFd::from(master)), path, run, link, faults, LineEnd::Terminal)
     }
 
-    /// Plugs in a device at the non-blocking end of a line; a driver opens the other end at `path`.
+    /// Plugs in a device at a guest's port, opened not to block; a driver opens the line's other end at `path`.
     ///
     /// # Errors
     /// When a thread cannot be created.
@@ -102,7 +102,7 @@ impl Pty {
         link: SerialLink,
         faults: WireFaults,
     ) -> io::Result<Self> {
-        Self::start(end, path, run, link, faults, Far::Port)
+        Self::start(end, path, run, link, faults, LineEnd::Port)
     }
 
     fn start(
@@ -111,7 +111,7 @@ impl Pty {
         run: Run,
         link: SerialLink,
         faults: WireFaults,
-        far: Far,
+        at: LineEnd,
     ) -> io::Result<Self> {
         let unplugged = Arc::new(AtomicBool::new(false));
         let mut wire = Wire {
@@ -119,13 +119,13 @@ impl Pty {
             device: run,
             link,
             faults,
-            far,
+            at,
             unplugged: unplugged.clone(),
             clock: Clock::real(),
             replies: 0,
         };
         let work = move || {
-            if far == Far::Terminal {
+            if at == LineEnd::Terminal {
                 run_as_soon_as_awake();
             }
             wire.run();
@@ -171,7 +171,7 @@ impl MirrorPty {
         Ok(Self { pty: Pty::plug(run_of(controller), link, faults)?, truth })
     }
 
-    /// Plugs in a controller at the non-blocking end of a line without faults; a driver opens the other end at `path`.
+    /// Plugs in a controller at a guest's port, opened not to block; a driver opens the line's other end at `path`.
     ///
     /// # Errors
     /// When a thread cannot be created.
@@ -236,13 +236,13 @@ pub fn run_as_soon_as_awake() {
     let _ = set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Min, policy);
 }
 
-/// What the controller has of the line.
+/// The line's end at which the controller is.
 #[derive(Clone, Copy, PartialEq)]
-enum Far {
+enum LineEnd {
     /// A pseudo-terminal. What the host does not read is lost, as on a real port.
     Terminal,
-    /// A port of an emulated guest, which takes one write at a time. The controller has no real-time priority: with
-    /// one processor it would starve the driver.
+    /// A port of an emulated guest, which takes one write at a time: replies wait for room, up to a second, in which the
+    /// controller does nothing else. It has no real-time priority, for with one processor it would starve the driver.
     Port,
 }
 
@@ -251,7 +251,7 @@ struct Wire {
     device: Run,
     link: SerialLink,
     faults: WireFaults,
-    far: Far,
+    at: LineEnd,
     unplugged: Arc<AtomicBool>,
     clock: Clock,
     replies: u64,
@@ -314,7 +314,7 @@ impl Wire {
             let garbage = (0..length).map(|n| (self.draw(&[3, self.replies, n]) * 256.0) as u8);
             replies.splice(0..0, garbage);
         }
-        if self.far == Far::Port {
+        if self.at == LineEnd::Port {
             let mut fds = [PollFd::new(self.end.as_fd(), PollFlags::POLLOUT)];
             let _ = poll(&mut fds, PollTimeout::from(1000_u16));
         }

@@ -119,9 +119,15 @@ mod tests {
 
     #[test]
     fn a_program_is_not_taken_for_its_own_unit_tests() {
-        let binary = |path: &str, is_test| Binary { path: path.into(), folder: PathBuf::new(), is_test };
+        let binary = |path: &str, is_test| Binary {
+            path: path.into(),
+            folder: PathBuf::new(),
+            kind: "bin".into(),
+            is_test,
+        };
         let binaries = [binary("/a/deps/raysweepd-89ab", true), binary("/a/raysweepd", false)];
         assert_eq!(find(&binaries, "raysweepd", false), Ok(PathBuf::from("/a/raysweepd")));
+        assert_eq!(find(&binaries, "raysweepd", true), Ok(PathBuf::from("/a/deps/raysweepd-89ab")));
         assert!(find(&binaries, "raysweep", false).is_err());
     }
 

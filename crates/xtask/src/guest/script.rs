@@ -10,7 +10,12 @@ const PREFACE: &str = "\
 modprobe virtio_console
 mkdir -p /dev/virtio-ports
 for name in $ports; do
-    until port=$(grep -lx $name /sys/class/virtio-ports/*/name 2>/dev/null); do sleep 0.1; done
+    tries=0
+    until port=$(grep -lx $name /sys/class/virtio-ports/*/name 2>/dev/null); do
+        tries=$((tries + 1))
+        [ $tries -lt 600 ] || { echo \"there is no port $name\" >/dev/console; break; }
+        sleep 0.1
+    done
     ln -s /dev/$(basename ${port%/name}) /dev/virtio-ports/$name
 done
 export RUST_BACKTRACE=1

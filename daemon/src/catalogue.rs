@@ -1,0 +1,78 @@
+//! What a data folder holds, as the socket tells it.
+
+use std::path::Path;
+
+use raysweep_processing::calibration::{CalibrationHeader, current_in};
+use raysweep_proto::{CalibrationInfo, SessionInfo};
+use raysweep_session::integrity::{Audit, Damage, DamagedPart};
+use raysweep_session::ledger::{EndState, LedgerText};
+use raysweep_session::{Session, SessionSummary};
+
+/// The procedure whose sessions hold calibrations.
+const CALIBRATION: &str = "calibration";
+
+/// The sessions of a data folder; those that cannot be read say why in their names.
+pub fn sessions_in(data: &Path) -> raysweep_session::Result<Vec<SessionInfo>> {
+    let listing = raysweep_session::list(data)?;
+    let readable = listing.sessions.into_iter().map(|session| SessionInfo {
+        session: session.dir,
+        name: session.name,
+        created: session.created.to_string(),
+        stored: session.stored,
+        points: session.points,
+        state: session.end.map_or("unfinished", EndState::name).into(),
+        kind: session.kind,
+        operator: session.operator,
+        sample: session.sample,
+        tags: session.tags,
+        warnings: session.warnings,
+    });
+    let unreadable = listing.unreadable.into_iter().map(|(dir, error)| SessionInfo {
+        session: dir,
+        name: error.to_string(),
+        created: String::new(),
+        stored: 0,
+        points: 0,
+        state: "unreadable".into(),
+        kind: String::new(),
+        operator: None,
+        sample: None,
+        tags: Vec::new(),
+        warnings: Vec::new(),
+    });
+    Ok(readable.chain(unreadable).collect())
+}
+
+/// The calibrations among the sessions of a data folder.
+pub fn calibrations_in(data: &Path) -> raysweep_session::Result<Vec<CalibrationInfo>> {
+    let listing = raysweep_session::list(data)?;
+    let in_use = CalibrationHeader::read(&current_in(data)).ok().flatten();
+    let measured = listing.sessions.into_iter().filter(|session| session.kind == CALIBRATION);
+    let info = |session: SessionSummary| {
+        let name = session.dir.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let (header, problem) = match CalibrationHeader::read(&session.dir) {
+            Ok(header @ Some(_)) => (header, None),
+            Ok(None) => (None, Some("its run did not succeed: see its report and ledger".into())),
+            Err(problem) => (None, Some(problem)),
+        };
+        CalibrationInfo {
+            session: session.dir,
+            made: header.as_ref().map_or_else(String::new, |header| header.made.to_string()),
+            camera: header.map_or_else(String::new, |header| header.valid_for.camera),
+            in_use: in_use.as_ref().is_some_and(|in_use| in_use.session == name),
+            problem,
+        }
+    };
+    Ok(measured.map(info).collect())
+}
+
+/// What of a session's calibration is damaged, if anything.
+pub fn damaged_calibration(session: &Session) -> raysweep_session::Result<Option<Damage>> {
+    let text = LedgerText::read(&session.ledger_path())?;
+    let state = text.replay(&session.ledger_path())?;
+    let is_of_calibration = |damage: &Damage| match &damage.part {
+        DamagedPart::Input { file } => file.starts_with("calibration."),
+        part => matches!(part, DamagedPart::Manifest),
+    };
+    Ok(Audit::without_data(session, &text, &state)?.damage.into_iter().find(is_of_calibration))
+}
