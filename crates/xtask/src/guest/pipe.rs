@@ -93,7 +93,7 @@ mod tests {
         let [mut one, mut other] = [(); 2].map(|()| UnixStream::connect(socket(&folder)).unwrap());
         connect(&listener).unwrap();
         std::fs::remove_dir_all(folder).unwrap();
-        [&one, &other].map(|end| end.set_read_timeout(Some(HUNG)).unwrap());
+        [&one, &other].iter().for_each(|end| end.set_read_timeout(Some(HUNG)).unwrap());
         one.set_write_timeout(Some(HUNG)).unwrap();
         let sent: Vec<u8> = (0..1_000_000_u32).map(|n| (n % 251) as u8).collect();
         // Pieces as small as packets of USB fill a socket soonest.
