@@ -7,13 +7,14 @@ mod hung;
 #[path = "suite/noise.rs"]
 mod noise;
 
+use std::io::Write;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
 use hung::HUNG;
 use raysweep_core::{Clock, DeviceErrorKind, Edge, Vsync};
 use raysweep_drivers::vsync::triggerbox::protocol::parse_reply;
-use raysweep_drivers::vsync::triggerbox::{TriggerBox, TriggerBoxConfig, TriggerBoxLink};
+use raysweep_drivers::vsync::triggerbox::{TriggerBox, TriggerBoxConfig, TriggerBoxLink, firmware};
 use raysweep_sim::mirror::{SerialLink as Wire, WireFaults};
 use raysweep_sim::triggerbox::TriggerBoxPty;
 
@@ -46,6 +47,27 @@ fn assert_on_grid(edges: &[Edge]) {
         let off_ns = (edge.host_ns + PERIOD_NS / 2).rem_euclid(PERIOD_NS) - PERIOD_NS / 2;
         assert!(off_ns.abs() < 2_000_000, "{off_ns} ns off");
         assert!(edge.host_ns <= Clock::real().now_ns(), "an edge from the future");
+    }
+}
+
+/// The firmware reads pairs of bytes.
+#[test]
+fn a_box_that_others_have_left_with_half_a_pair_is_found() {
+    let pty = plug(WireFaults::default());
+    std::fs::OpenOptions::new().write(true).open(pty.path()).unwrap().write_all(b"?").unwrap();
+    let mut vsync = TriggerBox::open(config(pty.path()), PERIOD_US).unwrap();
+    assert_on_grid(&edges(&mut vsync, 10));
+}
+
+/// A busy host passes answers on late: more questions are on their way by then.
+#[test]
+fn a_box_whose_answers_come_late_is_found_and_found_again() {
+    for seed in 1..=4 {
+        let pty = plug(WireFaults { seed, stalls: 0.05, stall_ms: 700, ..WireFaults::default() });
+        // Until the line has stalled for the first time.
+        std::thread::sleep(Duration::from_millis(200));
+        assert_eq!(firmware(pty.path()), Some(14));
+        TriggerBox::open(config(pty.path()), PERIOD_US).unwrap();
     }
 }
 

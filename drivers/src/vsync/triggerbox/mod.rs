@@ -53,24 +53,56 @@ fn bytes_ns(link: TriggerBoxLink, bytes: usize) -> i64 {
 /// Asks the box at a serial port for its firmware's version; `None` if no box answers. Its pulses stay as they are.
 pub fn firmware(port: &Path) -> Option<u8> {
     let mut port = Port::open(DEVICE, port, BAUD).ok()?;
-    let deadline = Instant::now() + HELLO_PATIENCE;
-    let question = TriggerBoxCommand::Version.to_bytes();
-    // The firmware reads pairs of bytes: what others have asked before may have left it with half a pair.
-    let after_half_a_pair = [b"?", question.as_slice()].concat();
-    for question in [&question, &after_half_a_pair].into_iter().cycle() {
-        if Instant::now() > deadline {
-            break;
-        }
-        port.send(question).ok()?;
-        let version = port.await_reply(HELLO_EVERY, parse_reply, |reply| match reply {
-            TriggerBoxReply::Version(version) => Some(version),
-            TriggerBoxReply::Time { .. } => None,
-        });
-        if let Some(version) = version.ok()? {
+    let (mut hello, deadline) = (Hello::default(), Instant::now() + HELLO_PATIENCE);
+    while Instant::now() <= deadline {
+        hello.ask(&mut port).ok()?;
+        if let Some(version) = hello.await_version(&mut port, HELLO_EVERY).ok()? {
             return Some(version);
         }
     }
     None
+}
+
+/// The questions that find a box. The firmware reads pairs of bytes, and others may have left it with half a pair: every
+/// second question begins with half a pair. Each has a number, which the answer repeats. So it is known that the box has
+/// read the last one to its end, and a late answer to an earlier one does not hide that a pair is open again.
+#[derive(Default)]
+struct Hello {
+    asked: Option<Instant>,
+    questions: u8,
+    version: Option<u8>,
+}
+
+impl Hello {
+    /// Sends a question, unless the last was sent a moment ago.
+    fn ask(&mut self, port: &mut Port) -> Result<(), DeviceError> {
+        if self.asked.is_some_and(|asked| asked.elapsed() < HELLO_EVERY) {
+            return Ok(());
+        }
+        self.asked = Some(Instant::now());
+        self.questions = self.questions.wrapping_add(1);
+        let mut bytes = if self.questions.is_multiple_of(2) { b"?".to_vec() } else { Vec::new() };
+        bytes.extend(TriggerBoxCommand::Version.to_bytes());
+        bytes.extend(TriggerBoxCommand::Time(self.number()).to_bytes());
+        port.send(&bytes)
+    }
+
+    /// Numbers fall from 255: those of [`Running`] rise from 0, and no late answer is taken for one of theirs.
+    fn number(&self) -> u8 {
+        u8::MAX.wrapping_sub(self.questions)
+    }
+
+    /// Waits for the version of a box that has read the last question, or of one with another protocol.
+    fn await_version(&mut self, port: &mut Port, timeout: Duration) -> Result<Option<u8>, DeviceError> {
+        let last = self.number();
+        port.await_reply(timeout, parse_reply, |reply| match reply {
+            TriggerBoxReply::Version(version) => {
+                self.version = Some(version);
+                self.version.filter(|&version| version != VERSION)
+            }
+            TriggerBoxReply::Time { number, .. } => self.version.filter(|_| number == last),
+        })
+    }
 }
 
 /// Why a box cannot be used, or cannot be used any longer.
@@ -103,9 +135,7 @@ pub struct TriggerBox {
 
 enum Stage {
     /// The box has not reported its version yet.
-    Greeting {
-        asked: Option<Instant>,
-    },
+    Greeting(Hello),
     Running(Running),
 }
 
@@ -133,7 +163,7 @@ impl TriggerBox {
     pub fn open(config: TriggerBoxConfig, period_us: f64) -> Result<Self, DeviceError> {
         let mut device = Self::connect(config, period_us)?;
         let deadline = Instant::now() + HELLO_PATIENCE;
-        while matches!(device.stage, Stage::Greeting { .. }) {
+        while matches!(device.stage, Stage::Greeting(_)) {
             device.greet(HELLO_EVERY)?;
             if Instant::now() > deadline {
                 let garbage = device.port.garbage_bytes();
@@ -156,7 +186,7 @@ impl TriggerBox {
             return Err(DeviceError::new(DEVICE, DeviceErrorKind::OutOfRange, error));
         };
         let port = Port::open(DEVICE, &config.port, BAUD)?;
-        Ok(Self { config, timer, port, clock: Clock::real(), stage: Stage::Greeting { asked: None } })
+        Ok(Self { config, timer, port, clock: Clock::real(), stage: Stage::Greeting(Hello::default()) })
     }
 
     fn error(&self, kind: DeviceErrorKind, what: impl FnOnce(String) -> TriggerBoxError) -> DeviceError {
@@ -165,15 +195,9 @@ impl TriggerBox {
 
     /// Requests the version and waits for it for up to `timeout`, then starts the timer.
     fn greet(&mut self, timeout: Duration) -> Result<(), DeviceError> {
-        let Stage::Greeting { asked } = &mut self.stage else { return Ok(()) };
-        if asked.is_none_or(|asked| asked.elapsed() >= HELLO_EVERY) {
-            *asked = Some(Instant::now());
-            self.port.send(&TriggerBoxCommand::Version.to_bytes())?;
-        }
-        let version = self.port.await_reply(timeout, parse_reply, |reply| match reply {
-            TriggerBoxReply::Version(version) => Some(version),
-            TriggerBoxReply::Time { .. } => None,
-        })?;
+        let Stage::Greeting(hello) = &mut self.stage else { return Ok(()) };
+        hello.ask(&mut self.port)?;
+        let version = hello.await_version(&mut self.port, timeout)?;
         match version {
             None => Ok(()),
             Some(VERSION) => {
@@ -304,7 +328,7 @@ impl Vsync for TriggerBox {
             let now_ns = self.clock.now_ns();
             let (timer, mut until_ns) = (self.timer, deadline_ns);
             match &mut self.stage {
-                Stage::Greeting { .. } => {
+                Stage::Greeting(_) => {
                     let left_ns = (deadline_ns - now_ns).max(0).unsigned_abs();
                     self.greet(HELLO_EVERY.min(Duration::from_nanos(left_ns)))?;
                 }
@@ -327,7 +351,7 @@ impl Vsync for TriggerBox {
 
     fn clock(&self) -> Option<ClockQuality> {
         match &self.stage {
-            Stage::Greeting { .. } => None,
+            Stage::Greeting(_) => None,
             Stage::Running(running) => running.model.quality(),
         }
     }
