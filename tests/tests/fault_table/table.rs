@@ -234,6 +234,13 @@ pub const TABLE: &[(&str, &[Row])] = &[
             "garbage_and_stalls_on_the_wire_cost_nothing_but_round_trips",
         ],
         [
+            "left with half a command by another program",
+            "found by the next question, which begins with half a command",
+            "nothing is begun before",
+            "drivers/tests/triggerbox.rs",
+            "a_box_that_others_have_left_with_half_a_pair_is_found",
+        ],
+        [
             "ten million bytes of noise",
             "each byte is an answer or counted as garbage",
             "no edge is made up",
