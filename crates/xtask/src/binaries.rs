@@ -87,14 +87,14 @@ fn binary(line: &str) -> Option<Binary> {
 
 /// Runs all tests; what those binaries said that fail is printed, and of all it is in the folder `tests` of the target.
 pub fn run_tests(binaries: &[Binary], environment: &[(&str, &Path)]) -> Done {
-    let logs = target().join("tests");
-    // Logs of earlier builds have other names.
-    let _ = std::fs::remove_dir_all(&logs);
-    std::fs::create_dir_all(&logs).map_err(|error| format!("{}: {error}", logs.display()))?;
     let mut tests: Vec<&Binary> = binaries.iter().filter(|binary| binary.is_test).collect();
     if tests.is_empty() {
         return Err("cargo built no tests".to_owned());
     }
+    let logs = target().join("tests");
+    // Logs of earlier builds have other names.
+    let _ = std::fs::remove_dir_all(&logs);
+    std::fs::create_dir_all(&logs).map_err(|error| format!("{}: {error}", logs.display()))?;
     tests.sort_by_key(|test| (&test.folder, test.name()));
     let began = Instant::now();
     let (next, failed) = (AtomicUsize::new(0), Mutex::new(Vec::new()));
