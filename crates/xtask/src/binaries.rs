@@ -110,7 +110,7 @@ pub fn run_tests(binaries: &[Binary], environment: &[(&str, &Path)]) -> Done {
             };
             let said = verdict.as_ref().unwrap_or_else(|said| said);
             // Whoever closed the pipe does not want to know.
-            let _ = say(&format!("{}: {said} ({:.0} s)", test.shown(), began.elapsed().as_secs_f64()));
+            let _ = say(&format!("{} ({:.0} s)\n{said}", test.shown(), began.elapsed().as_secs_f64()));
             if verdict.is_err() {
                 failed.lock().unwrap_or_else(PoisonError::into_inner).push(test.shown());
             }
@@ -151,14 +151,14 @@ fn run_test(test: &Binary, log: &Path, environment: &[(&str, &Path)]) -> std::io
     }
 }
 
-/// The line that says how many tests passed, and what was skipped; or all that was said.
+/// What was skipped, and the harness's own line of how many tests passed, by which others count them; or all that was
+/// said.
 fn verdict(status: ExitStatus, said: &str) -> Result<String, String> {
     let result = said.lines().rfind(|line| line.starts_with("test result: ok"));
     match result {
         Some(result) if status.success() => {
             let skipped = said.lines().filter(|line| line.contains("SKIPPED"));
-            let lines = std::iter::once(result.trim_start_matches("test result: ")).chain(skipped);
-            Ok(lines.collect::<Vec<_>>().join("\n  "))
+            Ok(skipped.chain([result]).collect::<Vec<_>>().join("\n"))
         }
         _ => Err(format!("{status}\n{said}")),
     }
@@ -197,9 +197,12 @@ mod tests {
     }
 
     #[test]
-    fn what_failed_is_told_whole_and_what_passed_in_a_line() {
+    fn what_failed_is_told_whole_and_of_what_passed_its_result() {
         let passed = "running 2 tests\nmounts: SKIPPED: forbidden\ntest result: ok. 2 passed; 0 failed";
-        assert_eq!(ran(passed, 0), Ok("ok. 2 passed; 0 failed\n  mounts: SKIPPED: forbidden".to_owned()));
+        assert_eq!(
+            ran(passed, 0),
+            Ok("mounts: SKIPPED: forbidden\ntest result: ok. 2 passed; 0 failed".to_owned())
+        );
         let said = ran("test a ... FAILED", 101).unwrap_err();
         assert!(said.contains("test a ... FAILED") && said.contains("101"), "{said}");
         // A process that ends before its tests has not passed, whatever its code; nor has one that crashes after them.
