@@ -152,13 +152,15 @@ impl MtiLine {
 
     /// Enters the command mode, or detects that the controller is already in it.
     fn enter(port: &Path, full_scale: MechanicalDeg) -> Result<(Self, String), DeviceError> {
-        let mut line = Self { port: LinePort::open(port, BAUD, "\n", parse_mti)?, full_scale };
-        let model = match line.port.ask(MtiCommand::Enter, REPLY_WAIT)? {
-            MtiReply::Device(model) => model,
-            MtiReply::Done | MtiReply::Refused(_) => "MTI controller".into(),
-        };
-        line.tell(MtiCommand::Echo, REPLY_WAIT)?;
-        Ok((line, model))
+        use MtiReply::{Device, Done, Refused};
+        let mut port = LinePort::open(port, BAUD, "\n", parse_mti)?;
+        let [enter, echo] = [MtiCommand::Enter, MtiCommand::Echo].map(|command| command.to_string());
+        let replies = port.greet(&[&enter, &echo], REPLY_WAIT, |reply| *reply == Done)?;
+        let model = replies.into_iter().find_map(|reply| match reply {
+            Device(model) => Some(model),
+            Done | Refused(_) => None,
+        });
+        Ok((Self { port, full_scale }, model.unwrap_or_else(|| "MTI controller".into())))
     }
 }
 

@@ -146,10 +146,7 @@ impl OptotuneLine {
     fn open(port: &Path, mut laser: Box<dyn Laser>) -> Result<Self, DeviceError> {
         // Also if the mirror cannot be reached.
         laser.switch(false)?;
-        let port = LinePort::open(port, BAUD, "\r\n", parse_optotune)?;
-        let mut line = Self { port, laser, lit: false };
-        line.tell(OptotuneCommand::Start)?;
-        Ok(line)
+        Ok(Self { port: greet_line(port)?, laser, lit: false })
     }
 
     fn light(&mut self, on: bool) -> Result<(), DeviceError> {
@@ -191,11 +188,16 @@ impl PointController for OptotuneLine {
     }
 }
 
+/// Opens the port of a controller that gives a sign of life.
+fn greet_line(port: &Path) -> Result<LinePort<OptotuneReply>, DeviceError> {
+    let mut line = LinePort::open(port, BAUD, "\r\n", parse_optotune)?;
+    line.greet(&[&OptotuneCommand::Start.to_string()], REPLY_WAIT, |reply| *reply == OptotuneReply::Ok)?;
+    Ok(line)
+}
+
 /// Asks the controller at this port for a sign of life. Its laser's port is not opened, which would switch it.
 pub(super) fn greet(port: &Path) -> Result<String, DeviceError> {
-    let port = LinePort::open(port, BAUD, "\r\n", parse_optotune)?;
-    let mut line = OptotuneLine { port, laser: Box::new(NoLaser), lit: false };
-    line.tell(OptotuneCommand::Start)?;
+    greet_line(port)?;
     Ok(MODEL.into())
 }
 

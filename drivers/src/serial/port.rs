@@ -29,7 +29,7 @@ const LOOK: Duration = Duration::from_millis(2);
 /// After this long without a reply, none is on its way: a line at 115,200 baud and a USB adapter's 16 ms are faster.
 const SILENCE: Duration = Duration::from_millis(50);
 /// A device that sends more unrequested replies than this never falls silent.
-const MOST_STALE: usize = 16;
+pub(crate) const MOST_STALE: usize = 16;
 
 /// An open port in exclusive use, and the bytes received from it.
 pub(crate) struct Port {

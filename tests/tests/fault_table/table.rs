@@ -334,6 +334,13 @@ pub const TABLE: &[(&str, &[Row])] = &[
             "stop_of_a_controller_that_stalls",
         ],
         [
+            "late answers to what a killed program left",
+            "not taken for answers to the driver's own commands",
+            "the mirror is parked before anything else",
+            "drivers/src/mirror/lines.rs",
+            "a_late_answer_to_what_another_program_left_is_not_taken_for_that_to_a_command",
+        ],
+        [
             "garbage while it is stopped",
             "parked; the light is off",
             "as before",
