@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 
 use raysweep_core::{DeviceErrorKind, Mirror, MirrorPath, Tilt};
 use raysweep_drivers::mirror::{self, PlayzerX};
+use raysweep_sim::mirror::WireFaults;
 
 use crate::rig::LIMITS;
 use crate::scripts::{Script, frame, play};
@@ -107,6 +108,10 @@ struct Lab {
 
 impl Lab {
     fn new(rate_hz: f64) -> Self {
+        Self::on_wire(rate_hz, WireFaults::default())
+    }
+
+    fn on_wire(rate_hz: f64, faults: WireFaults) -> Self {
         let desk = Arc::new(Mutex::new(Desk {
             drain: Drain::ByClock(rate_hz),
             frames: Vec::new(),
@@ -121,7 +126,7 @@ impl Lab {
         }));
         let answering = desk.clone();
         let answer = move |message: &[u8], now_ns| answering.lock().unwrap().answer(message, now_ns);
-        Self { script: Script::with(frame, answer), desk }
+        Self { script: Script::on_wire(faults, frame, answer), desk }
     }
 
     fn open(&self) -> PlayzerX {
@@ -272,8 +277,10 @@ fn parking_empties_the_fifo_and_ramps_from_the_sample_that_the_count_tells() {
 
 #[test]
 fn an_answer_to_a_killed_process_does_not_tell_the_place_to_whoever_parks_next() {
-    for pause_ms in [8, 60] {
-        let lab = Lab::new(1000.0);
+    // After a stall, the samples that darken the mirror and move it come at once, and the questions with them.
+    for (pause_ms, stalls) in [(8, 0.0), (60, 0.0), (8, 0.03)] {
+        let faults = WireFaults { stalls, stall_ms: 30, ..WireFaults::default() };
+        let lab = Lab::on_wire(1000.0, faults);
         let mut mirror = lab.open();
         mirror.load(&turn(2000, 1000.0)).unwrap();
         mirror.start(2).unwrap();

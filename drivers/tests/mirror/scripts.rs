@@ -33,6 +33,15 @@ impl Script {
     /// Every message gets the answer that `answer` returns at that time.
     pub fn with(
         message: fn(&[u8]) -> Option<usize>,
+        answer: impl FnMut(&[u8], i64) -> Vec<u8> + Send + 'static,
+    ) -> Self {
+        Self::on_wire(WireFaults::default(), message, answer)
+    }
+
+    /// The same, on a wire with faults.
+    pub fn on_wire(
+        faults: WireFaults,
+        message: fn(&[u8]) -> Option<usize>,
         mut answer: impl FnMut(&[u8], i64) -> Vec<u8> + Send + 'static,
     ) -> Self {
         let heard = Arc::new(Mutex::new(Vec::new()));
@@ -46,7 +55,7 @@ impl Script {
                 replies.extend(answer(&message, now_ns));
             }
         };
-        let pty = Pty::plug(Box::new(run), SerialLink::VirtualCom, WireFaults::default()).unwrap();
+        let pty = Pty::plug(Box::new(run), SerialLink::VirtualCom, faults).unwrap();
         Self { pty, heard, folder: tempfile::tempdir().unwrap() }
     }
 

@@ -39,6 +39,9 @@ const QUESTIONS: usize = 3;
 /// A controller that sends more replies than this is not answering.
 const MOST_REPLIES: usize = 64;
 
+/// Samples that may lie in the FIFO before a sequence: the one that switched the light off.
+const DARK_SAMPLES: u64 = 1;
+
 /// A query for the samples left.
 struct Question {
     asked: Instant,
@@ -74,7 +77,7 @@ pub struct SampleStream {
 }
 
 impl SampleStream {
-    /// The FIFO must be empty.
+    /// The FIFO must be empty but for [`DARK_SAMPLES`].
     pub fn new(sequence: Sequence, rate_hz: f64, full_scale: MechanicalDeg) -> Self {
         let now = Instant::now();
         Self {
@@ -142,7 +145,9 @@ impl SampleStream {
             PlayzerXCommand::Sample(sample).to_bytes(&mut self.out);
         }
         self.next += samples;
-        if self.question.is_none() && (is_in_doubt || self.asked.elapsed() >= ASK_EVERY) {
+        // Nothing is asked once all are played: whoever uses the port next would get the answer.
+        let is_time = !self.is_played() && (is_in_doubt || self.asked.elapsed() >= ASK_EVERY);
+        if self.question.is_none() && is_time {
             PlayzerXCommand::SamplesLeft.to_bytes(&mut self.out);
         }
         !self.out.is_empty()
@@ -208,7 +213,8 @@ impl SampleStream {
     fn played_of(&self, sent: u64, left: u64) -> Option<u64> {
         let since = self.began.map_or(Duration::ZERO, |began| self.answer_asked.max(began).elapsed());
         let most = self.played as f64 + since.as_secs_f64() * self.asked_rate_hz * 1.1 + 2.0;
-        sent.checked_sub(left).filter(|&played| played >= self.played && played as f64 <= most)
+        let played = sent.saturating_sub(left);
+        (left <= sent + DARK_SAMPLES && played >= self.played && played as f64 <= most).then_some(played)
     }
 
     /// Whether more samples must follow the first `sent` without a gap.
