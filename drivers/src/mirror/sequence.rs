@@ -50,6 +50,12 @@ impl Sequence {
         sequence
     }
 
+    /// A rest, `times` as long as that after an approach.
+    pub fn rest(at: Tilt, rate_hz: f64, times: u32) -> Self {
+        let path = dwell(at, rate_hz, MEASURE_S).collect();
+        Self { from: at, lead: Vec::new(), path, batches: times, tail: Vec::new() }
+    }
+
     /// A path from its first point, `batches` times, then to the origin.
     pub fn play(path: &MirrorPath, batches: u32, limits: &MirrorLimits) -> Self {
         let (first, last) = (path.at(0).tilt, path.at(path.points().len() as u64 - 1).tilt);

@@ -78,14 +78,16 @@ fn a_full_fifo_is_not_overfilled_when_the_mirror_is_stopped_and_started_again() 
 
 #[test]
 fn a_rate_that_the_controller_does_not_keep_is_found_out() {
-    let rig = Rig::playzerx(
-        PlayzerXControllerConfig { max_rate_hz: 30_000.0, ..Default::default() },
-        WireFaults::default(),
-    );
-    let mut mirror = rig.open();
-    let error = mirror.load(&batch()).unwrap_err();
-    assert_eq!(error.kind, DeviceErrorKind::OutOfRange, "{error}");
-    rig.assert_parked();
+    // Also where most answers are late.
+    for stalls in [0.0, 0.5] {
+        let slow = PlayzerXControllerConfig { max_rate_hz: 30_000.0, ..Default::default() };
+        let faults = WireFaults { stalls, stall_ms: 20, ..WireFaults::default() };
+        let rig = Rig::playzerx(slow, faults);
+        let mut mirror = rig.open();
+        let error = mirror.load(&batch()).unwrap_err();
+        assert_eq!(error.kind, DeviceErrorKind::OutOfRange, "{error}");
+        rig.assert_parked();
+    }
 }
 
 #[test]

@@ -39,6 +39,8 @@ const RESET_WAIT: Duration = Duration::from_millis(2500);
 const LIGHT_CHECK: Duration = Duration::from_millis(50);
 /// Maximum relative deviation of the controller's actual rate from the requested one; includes the measurement error.
 const RATE_TOLERANCE: f64 = 0.03;
+/// Times of rest, in multiples of that after an approach, in which the rate is measured where that was too short.
+const LONGER_RESTS: [u32; 3] = [2, 4, 8];
 
 /// Which PlayzerX, and what it may do.
 #[derive(Debug, Clone, PartialEq)]
@@ -173,9 +175,20 @@ impl PlayzerX {
         let mut set_rate = Vec::new();
         PlayzerXCommand::SetRate(rate_hz as u32).to_bytes(&mut set_rate);
         self.port.send(&set_rate)?;
-        let sequence = Sequence::approach(Tilt::ORIGIN, path.at(0).tilt, rate_hz, &limits);
-        self.record(&sequence, rate_hz)?;
-        let actual_hz = self.play_out(sequence, rate_hz, true)?.unwrap_or(rate_hz);
+        let place = path.at(0).tilt;
+        let mut sequence = Sequence::approach(Tilt::ORIGIN, place, rate_hz, &limits);
+        let mut rests = LONGER_RESTS.into_iter();
+        let actual_hz = loop {
+            self.record(&sequence, rate_hz)?;
+            if let Some(actual_hz) = self.play_out(sequence, rate_hz, true)? {
+                break actual_hz;
+            }
+            let Some(rests) = rests.next() else {
+                let what = "nothing tells whether the controller keeps the rate, for its answers come too late: end other work on this computer";
+                return Err(fault(DeviceErrorKind::Timeout, what));
+            };
+            sequence = Sequence::rest(place, rate_hz, rests);
+        };
         if (actual_hz / rate_hz - 1.0).abs() > RATE_TOLERANCE {
             return Err(fault(
                 DeviceErrorKind::OutOfRange,

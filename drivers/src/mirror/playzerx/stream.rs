@@ -24,8 +24,8 @@ const WRITES_PER_STEP: usize = 256;
 const SPARE_SAMPLES: u64 = 1000;
 /// Interval of querying the samples left.
 const ASK_EVERY: Duration = Duration::from_millis(10);
-/// The time of an answer with a longer round trip is too uncertain.
-const LONGEST_ROUND_TRIP: Duration = Duration::from_millis(5);
+/// A rate that is less certain (relative standard error) is not stated.
+const RATE_ERROR: f64 = 0.01;
 /// Maximum time for an answer while the FIFO, of three seconds, plays on; after it, no more samples are sent.
 const ANSWER_WAIT: Duration = Duration::from_secs(1);
 /// The longest time between two steps of a host that is not busy.
@@ -193,10 +193,12 @@ impl SampleStream {
             self.moved = Instant::now();
         }
         self.played = played;
-        if left > 0 && asked.elapsed() <= LONGEST_ROUND_TRIP {
-            let began = self.began.unwrap_or(asked);
-            let seconds = (asked.duration_since(began) + asked.elapsed() / 2).as_secs_f64();
-            self.rate.push(seconds, played as f64);
+        if left > 0 {
+            let (began, round_trip) = (self.began.unwrap_or(asked), asked.elapsed());
+            let seconds = (asked.duration_since(began) + round_trip / 2).as_secs_f64();
+            // The count was taken at any time of the round trip and of a sample.
+            let within_s = round_trip.as_secs_f64().hypot(1.0 / self.asked_rate_hz);
+            self.rate.push(seconds, played as f64, within_s);
         }
         if left == 0 && self.is_within_path(sent) {
             return Err(fault(
@@ -308,10 +310,11 @@ pub fn halt(port: &mut Port, unanswered: usize) -> Result<Option<u32>, DeviceErr
     Ok(None)
 }
 
-/// Fits a straight line through (seconds, samples).
+/// Fits a straight line through (seconds, samples), each weighted by the certainty of its time.
 #[derive(Debug, Default)]
 struct RateFit {
-    count: f64,
+    count: u32,
+    weight: f64,
     seconds: f64,
     samples: f64,
     seconds_squared: f64,
@@ -320,20 +323,24 @@ struct RateFit {
 
 impl RateFit {
     /// Minimum number of points for a rate.
-    const FEWEST: f64 = 8.0;
+    const FEWEST: u32 = 8;
 
-    fn push(&mut self, seconds: f64, samples: f64) {
-        self.count += 1.0;
-        self.seconds += seconds;
-        self.samples += samples;
-        self.seconds_squared += seconds * seconds;
-        self.product += seconds * samples;
+    /// The time of a point lies anywhere within an interval of this length.
+    fn push(&mut self, seconds: f64, samples: f64, within_s: f64) {
+        // The variance of a uniform distribution.
+        let weight = 12.0 / within_s.powi(2);
+        self.count += 1;
+        self.weight += weight;
+        self.seconds += weight * seconds;
+        self.samples += weight * samples;
+        self.seconds_squared += weight * seconds * seconds;
+        self.product += weight * seconds * samples;
     }
 
     fn rate_hz(&self) -> Option<f64> {
-        let spread = self.count * self.seconds_squared - self.seconds * self.seconds;
-        (self.count >= Self::FEWEST && spread > 0.0)
-            .then(|| (self.count * self.product - self.seconds * self.samples) / spread)
+        let spread = self.seconds_squared - self.seconds * self.seconds / self.weight;
+        (self.count >= Self::FEWEST && spread.sqrt().recip() < RATE_ERROR)
+            .then(|| (self.product - self.seconds * self.samples / self.weight) / spread)
     }
 }
 
@@ -347,8 +354,27 @@ mod tests {
         for n in 0..20 {
             assert_eq!(fit.rate_hz().is_some(), n >= 8);
             let seconds = f64::from(n) * 0.01;
-            fit.push(seconds, 39_000.0 * seconds + 17.0);
+            fit.push(seconds, 39_000.0 * seconds + 17.0, 0.001);
         }
-        assert!((fit.rate_hz().unwrap() - 39_000.0).abs() < 1e-6);
+        // An answer that was under way for long changes little.
+        fit.push(0.2, 0.0, 10.0);
+        assert!((fit.rate_hz().unwrap() / 39_000.0 - 1.0).abs() < 1e-4);
+    }
+
+    #[test]
+    fn a_rate_between_late_answers_is_stated_once_it_is_certain() {
+        let mut fit = RateFit::default();
+        let (lates, late_s) = ([0.2, 0.9, 0.4, 0.7, 0.1, 0.6], 0.016);
+        let mut stated = Vec::new();
+        for n in 0..60 {
+            let asked_s = f64::from(n) * late_s;
+            // The controller counts at some time of the round trip.
+            let samples = 10_000.0 * (asked_s + lates[n as usize % lates.len()] * late_s);
+            fit.push(asked_s + late_s / 2.0, samples, late_s);
+            stated.push(fit.rate_hz());
+        }
+        assert!(stated[15].is_none());
+        assert!(stated.iter().flatten().count() > 20);
+        assert!(stated.iter().flatten().all(|rate_hz| (rate_hz / 10_000.0 - 1.0).abs() < 2.0 * RATE_ERROR));
     }
 }
