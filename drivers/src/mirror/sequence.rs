@@ -52,8 +52,8 @@ impl Sequence {
 
     /// A rest, `times` as long as that after an approach.
     pub fn rest(at: Tilt, rate_hz: f64, times: u32) -> Self {
-        let path = dwell(at, rate_hz, MEASURE_S).collect();
-        Self { from: at, lead: Vec::new(), path, batches: times, tail: Vec::new() }
+        let [lead, path] = [LEAD_S, MEASURE_S].map(|seconds| dwell(at, rate_hz, seconds).collect());
+        Self { from: at, lead, path, batches: times, tail: Vec::new() }
     }
 
     /// A path from its first point, `batches` times, then to the origin.

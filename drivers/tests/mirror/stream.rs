@@ -91,6 +91,22 @@ fn a_rate_that_the_controller_does_not_keep_is_found_out() {
 }
 
 #[test]
+fn a_rate_is_measured_also_between_rare_answers() {
+    for (max_rate_hz, keeps) in [(30_000.0, true), (900.0, false)] {
+        let slow = PlayzerXControllerConfig { max_rate_hz, ..Default::default() };
+        let rig = Rig::playzerx(slow, WireFaults { stalls: 0.5, stall_ms: 100, ..WireFaults::default() });
+        let path = MirrorPath::lissajous(Tilt::new(3.0, 2.0), [1, 1], 1000, 1000.0, &LIMITS).unwrap();
+        let mut mirror = rig.open();
+        match mirror.load(&path) {
+            Ok(rate_hz) => assert!(keeps && (rate_hz / 1000.0 - 1.0).abs() < 0.03, "{rate_hz}"),
+            Err(error) => assert!(!keeps && error.kind == DeviceErrorKind::OutOfRange, "{error}"),
+        }
+        drop(mirror);
+        rig.assert_parked();
+    }
+}
+
+#[test]
 fn what_the_link_or_the_limits_forbid_is_refused_before_anything_moves() {
     let rig = Rig::good();
     let uart = mirror::PlayzerXConfig { link: mirror::PlayzerXLink::Uart, ..rig.config() };
