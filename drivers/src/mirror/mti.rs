@@ -156,7 +156,8 @@ impl MtiLine {
         let mut port = LinePort::open(port, BAUD, "\n", parse_mti)?;
         let [enter, echo] = [MtiCommand::Enter, MtiCommand::Echo].map(|command| command.to_string());
         let replies = port.greet(&[&enter, &echo], REPLY_WAIT, |reply| *reply == Done)?;
-        let model = replies.into_iter().find_map(|reply| match reply {
+        // An earlier one is what another program was told when it left.
+        let model = replies.into_iter().rev().find_map(|reply| match reply {
             Device(model) => Some(model),
             Done | Refused(_) => None,
         });
