@@ -151,8 +151,8 @@ fn run_test(test: &Binary, log: &Path, environment: &[(&str, &Path)]) -> std::io
     }
 }
 
-/// What was skipped, and the harness's own line of how many tests passed, by which others count them; or all that was
-/// said.
+/// What was skipped, and the harness's line `test result: …` unchanged, as cargo prints it, for scripts that count tests;
+/// or all that was said.
 fn verdict(status: ExitStatus, said: &str) -> Result<String, String> {
     let result = said.lines().rfind(|line| line.starts_with("test result: ok"));
     match result {

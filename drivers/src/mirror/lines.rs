@@ -32,8 +32,8 @@ impl<R: Debug> LinePort<R> {
         Ok(Self { port, line_end, parse })
     }
 
-    /// Asks, until a reply is one that only the last command gets, and returns all replies; those before it, which a busy
-    /// host may bring late, answer what another program left on the line.
+    /// Asks until a reply is of the kind that the last command gets, discards what still comes, and returns all replies;
+    /// those before the last, which a busy host may bring late, answer what another program left on the line.
     pub fn greet(
         &mut self,
         commands: &[&str],

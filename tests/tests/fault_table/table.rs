@@ -334,9 +334,9 @@ pub const TABLE: &[(&str, &[Row])] = &[
             "stop_of_a_controller_that_stalls",
         ],
         [
-            "late answers to what a killed program left",
-            "not taken for answers to the driver's own commands",
-            "the mirror is parked before anything else",
+            "late answer to half a line that a killed program left",
+            "not taken for the answer to the driver's own command",
+            "as before",
             "drivers/src/mirror/lines.rs",
             "a_late_answer_to_what_another_program_left_is_not_taken_for_that_to_a_command",
         ],

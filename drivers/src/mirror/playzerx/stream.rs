@@ -146,8 +146,8 @@ impl SampleStream {
         }
         self.next += samples;
         // Nothing is asked once all are played: whoever uses the port next would get the answer.
-        let is_time = !self.is_played() && (is_in_doubt || self.asked.elapsed() >= ASK_EVERY);
-        if self.question.is_none() && is_time {
+        let may_ask = !self.is_played() && (is_in_doubt || self.asked.elapsed() >= ASK_EVERY);
+        if self.question.is_none() && may_ask {
             PlayzerXCommand::SamplesLeft.to_bytes(&mut self.out);
         }
         !self.out.is_empty()
@@ -327,8 +327,8 @@ impl RateFit {
 
     /// The time of a point lies anywhere within an interval of this length.
     fn push(&mut self, seconds: f64, samples: f64, within_s: f64) {
-        // The variance of a uniform distribution.
-        let weight = 12.0 / within_s.powi(2);
+        // A stall holds the time at one end of the interval: its standard error is half of it.
+        let weight = 4.0 / within_s.powi(2);
         self.count += 1;
         self.weight += weight;
         self.seconds += weight * seconds;
