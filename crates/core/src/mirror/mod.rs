@@ -161,7 +161,7 @@ pub struct MirrorProgress {
     pub total: u64,
     /// Whether it has played all samples and is back at the origin with the light off.
     pub parked: bool,
-    /// Samples per second according to the confirmations; `None` until enough have arrived.
+    /// Samples per second according to the confirmations; `None` until they make it certain.
     pub rate_hz: Option<f64>,
 }
 
@@ -177,7 +177,8 @@ pub trait Mirror: Send {
     /// that the controller really keeps.
     ///
     /// # Errors
-    /// `OutOfRange` if the controller cannot keep the path's rate or the path breaks its limits.
+    /// `OutOfRange` if the controller cannot keep the path's rate or the path breaks its limits; `Timeout` if its answers
+    /// come too late to tell.
     fn load(&mut self, path: &MirrorPath) -> Result<f64, DeviceError>;
 
     /// Starts playing the loaded path `batches` times. Afterwards the mirror returns to the origin by itself, with
