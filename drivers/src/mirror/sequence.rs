@@ -50,7 +50,7 @@ impl Sequence {
         sequence
     }
 
-    /// A rest, `times` as long as that after an approach.
+    /// A rest, `times` as long as that after an approach, and like a path with a lead that fills the FIFO and without gaps.
     pub fn rest(at: Tilt, rate_hz: f64, times: u32) -> Self {
         let [lead, path] = [LEAD_S, MEASURE_S].map(|seconds| dwell(at, rate_hz, seconds).collect());
         Self { from: at, lead, path, batches: times, tail: Vec::new() }
