@@ -13,6 +13,7 @@ mod python;
 mod rootfs;
 mod run;
 mod soak;
+mod space;
 mod test;
 
 use std::process::ExitCode;
@@ -24,15 +25,14 @@ const USAGE: &str = "\
 usage: cargo xtask <command>
 
   demo               builds, runs the paper's sweep on the simulated rig, writes a report
-  test [--no-guest]  installs what the tests need, checks format, lints and tests, the guest's last;
+  test [--no-guest]  installs what the tests need, checks format, lints and tests, the guests' last;
                      --no-guest leaves those out
   packages           what the tests need of Debian, what of it is missing, and how to install it
   fresh [12|13]...   runs demo and test of the last commit on a bare Debian 12 (bookworm) and 13 (trixie), or on
                      one: about 40 minutes each
   deb                builds the Debian package and prints its path
   guest [TEST...]    the drivers' tests against real kernel drivers in a QEMU guest, or some of them
-  guest --systemd    the package under systemd in a QEMU guest: installed, used, killed, cut off from power; not
-                     part of `test`, and one of its checks still fails
+  guest --systemd    the package under systemd in a QEMU guest: installed, used, killed, cut off from power
   soak [--minutes N] runs all procedures with faults, misbehaving clients and kills for 20 minutes, or N; reports
                      growth, differences and losses
   bench [NAME]       measures; without a name, tells which benchmarks there are";

@@ -3,19 +3,25 @@
 use std::process::Command;
 
 use crate::run::{Done, cargo, run, target};
-use crate::{binaries, guest, packages, python, rootfs};
+use crate::{binaries, guest, packages, python, rootfs, space};
 
-/// Whether to run the tests in the kernel guest.
+/// What all of this command leaves in the target folder.
+const TARGET_GIB: u64 = 11;
+/// What tests that run at once have in the folder for temporary files.
+const TEMPORARY_GIB: u64 = 2;
+
+/// Whether to run the tests in virtual machines.
 #[derive(Clone, Copy, PartialEq)]
 pub enum Guest {
     Run,
     Skip,
 }
 
-/// Installs missing packages, then checks format, lints, fuzz targets, tests, doc tests, and tests in the kernel guest.
+/// Installs missing packages, then checks format, lints, fuzz targets, tests, doc tests, and tests in both guests.
 pub fn test(wanted: Guest) -> Done {
     has_components()?;
     has_networks()?;
+    has_space()?;
     packages::install()?;
     // Packages that read our files in practice.
     let python = python::environment("python", "requirements.txt")?;
@@ -24,12 +30,17 @@ pub fn test(wanted: Guest) -> Done {
     run(cargo().args(["clippy", "--workspace", "--all-targets", "--all-features", "--", "-D", "warnings"]))?;
     // A separate workspace, which nothing else compiles; in the same folder, it shares what the lints have built.
     run(cargo().args(["check", "--manifest-path", "fuzz/Cargo.toml", "--target-dir"]).arg(target()))?;
+    let built = binaries::build()?;
+    has_space()?;
     // All failures at once: the next look at them is half an hour away.
-    let tested = binaries::run_tests(&binaries::build()?, &[("RAYSWEEP_PYTHON", &python)]);
+    let tested = binaries::run_tests(&built, &[("RAYSWEEP_PYTHON", &python)]);
     run(cargo().args(["test", "--workspace", "--all-features", "--doc", "--quiet"]))?;
     tested?;
     match wanted {
-        Guest::Run => guest::guest(&[]),
+        Guest::Run => {
+            let drivers = guest::guest(&[]);
+            guest::systemd::systemd().and(drivers)
+        }
         Guest::Skip => {
             println!("{}", guest::skipped());
             Ok(())
@@ -47,6 +58,14 @@ fn has_networks() -> Done {
         "be root: sudo env \"PATH=$PATH\" \"HOME=$HOME\" cargo xtask test"
     };
     Err(format!("the tests need networks of their own, and `unshare --net` fails here ({error}); {remedy}"))
+}
+
+/// Fails where the build or the tests would fill the disk.
+fn has_space() -> Done {
+    let target = target();
+    let missing_gib = TARGET_GIB.saturating_sub(space::taken_gib(&target));
+    space::require(&target, missing_gib, "what is built takes another")?;
+    space::require(&std::env::temp_dir(), TEMPORARY_GIB, "the tests write up to")
 }
 
 fn unshare_network() -> Done {

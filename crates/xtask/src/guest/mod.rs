@@ -59,10 +59,13 @@ pub fn guest(names: &[&str]) -> Done {
     Ok(())
 }
 
-/// Message when the guest is skipped on request.
+/// Message when the guests are skipped on request.
 pub fn skipped() -> String {
     let names: Vec<&str> = TESTS.iter().map(|test| test.name).collect();
-    format!("kernel guest: SKIPPED (--no-guest); not tested against the kernel: {}", names.join(", "))
+    format!(
+        "kernel guest and systemd guest: SKIPPED (--no-guest); not tested under systemd: the package; against the kernel: {}",
+        names.join(", ")
+    )
 }
 
 fn chosen(names: &[&str]) -> Done<Vec<&'static GuestTest>> {

@@ -6,6 +6,8 @@ installs() {
     dpkg -i /share/raysweep.deb && await is_active && systemctl --quiet is-enabled raysweepd.socket raysweepd.service
 }
 check "the package installs, and its simulated rig serves" installs
+# A smaller scene, as each start builds it.
+cp /share/rig.toml /etc/raysweep/rig.toml
 useradd -m -G raysweep ada
 useradd -m eve
 operator_at_once() { systemctl stop raysweepd.service && code 0 as ada raysweep status && await is_active; }
@@ -27,7 +29,6 @@ check "examples name only what is installed" examples
 pages() { zgrep -q "raysweep" /usr/share/man/man1/raysweep-run.1.gz /usr/share/man/man8/raysweepd.8.gz; }
 check "manual pages are there" pages
 
-cp /share/rig.toml /etc/raysweep/rig.toml
 mkdir -p /etc/systemd/system/raysweepd.service.d
 # Reloading runs this within the unit's sandbox: the devices are opened by the service that runs, as its user.
 printf '[Service]\nExecReload=/bin/sh /share/open.sh\n' >/etc/systemd/system/raysweepd.service.d/open.conf
