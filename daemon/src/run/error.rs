@@ -82,11 +82,13 @@ pub enum RunError {
     },
     /// A thread of the run has ended unexpectedly; another error says which and why.
     #[error(
-        "a thread of the run has ended unexpectedly; see the log. The stored data are kept; resume the session"
+        "a thread of the run has ended unexpectedly; see the log. The stored data are kept: resume the session (films and batches: `raysweep process` it)"
     )]
     Interrupted,
     /// The run panicked, which is a bug.
-    #[error("the run panicked, which is a bug: {0}. The stored data are kept; resume the session")]
+    #[error(
+        "the run panicked, which is a bug: {0}. The stored data are kept: resume the session (films and batches: `raysweep process` it)"
+    )]
     Panicked(String),
 }
 

@@ -578,6 +578,27 @@ pub const TABLE: &[(&str, &[Row])] = &[
             "a_panic_of_the_run_s_thread_ends_the_run",
         ],
         [
+            "panic of the thread of a dot rig's camera",
+            "the run is faulted; the mirror is parked and its light off",
+            "kept",
+            "tests/tests/fault_table/dots.rs",
+            "a_panic_of_a_dot_camera_s_thread_parks_the_mirror",
+        ],
+        [
+            "panic of the mirror's thread",
+            "the run is faulted; the mirror is parked and its light off",
+            "kept",
+            "tests/tests/fault_table/dots.rs",
+            "a_panic_of_the_mirror_s_thread_parks_the_mirror",
+        ],
+        [
+            "panic between a mirror's way to its path and the path",
+            "the run is faulted; the mirror is parked and its light off",
+            "kept",
+            "tests/tests/fault_table/dots.rs",
+            "a_panic_before_the_mirror_plays_parks_the_mirror",
+        ],
+        [
             "panic of a worker in a stage",
             "its unit is left out of the results",
             "all raw data are stored",

@@ -1,6 +1,7 @@
 //! Plays a path with the mirror while the camera takes its frames, and has the operator place subjects.
 
 use std::any::Any;
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread;
 
@@ -88,12 +89,11 @@ impl Player<'_> {
                     if pace == Pace::Devices && !is_simulated {
                         priority::for_device("camera");
                     }
-                    let over = SetOnDrop(&camera_over);
-                    let taken = source.take(&wanted, &mut deliver);
-                    drop(over);
+                    let taken = catch_unwind(AssertUnwindSafe(|| source.take(&wanted, &mut deliver)));
+                    camera_over.store(true, Ordering::Relaxed);
                     // A virtual clock stops if nobody reads the camera, but the mirror must come to rest.
                     source.idle(&|| path_over.load(Ordering::Relaxed));
-                    taken
+                    taken.unwrap_or_else(|panic| resume_unwind(panic))
                 })
                 .map_err(|source| PipelineError::Spawn { name: "camera", source: source.into() })?;
             let motion = &mut *self.motion;

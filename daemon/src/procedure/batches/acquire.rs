@@ -48,16 +48,12 @@ pub struct Acquired {
 ///
 /// # Errors
 /// When the run could not begin. A later fault is in [`Acquired::fault`]: what was acquired is kept.
-pub fn acquire(
-    rig: &DotRig,
-    task: &Arc<DotTask>,
-    probes: &Probes,
-    mut run: Run,
-) -> Result<Acquired, RunError> {
+pub fn acquire(rig: &DotRig, task: &Arc<DotTask>, mut run: Run) -> Result<Acquired, RunError> {
     run.note_beginning()?;
     let earlier = task.earlier_flat_field(&run.data)?;
     let rate_hz = task.batches.camera_rate_hz();
-    let DotDevices { mut camera, mirror, stand, clock, pace, .. } = rig.open(&run.data, rate_hz)?;
+    let opened = rig.open(&run.data, rate_hz)?;
+    let DotDevices { mut camera, mirror, stand, clock, pace, .. } = run.probes.instead_of_dots(opened);
     let mut motion = Motion::new(mirror);
     let shape = task.shape;
     let found = (camera.capabilities().height, camera.capabilities().width);
@@ -83,7 +79,7 @@ pub fn acquire(
     let _ = run.board.go(RunState::Running);
     let mut passes = DotPasses {
         task,
-        probes,
+        probes: &run.probes,
         session: &run.session,
         earlier,
         orders: &run.orders,

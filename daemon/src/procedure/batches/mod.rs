@@ -15,7 +15,6 @@ use raysweep_session::stack::StackShape;
 
 use self::acquire::{Acquired, acquire};
 use crate::devices::dots::{FRAMES_AT_WORK, frames_waiting};
-use crate::probes::Probes;
 use crate::procedure::lab::Lab;
 use crate::rig::{DotRig, Pace};
 use crate::run::error::RunError;
@@ -25,7 +24,6 @@ use crate::run::life::{Ended, Foreseen, Measurement, Run, end_state};
 struct BatchesRun {
     rig: Arc<DotRig>,
     task: Arc<DotTask>,
-    probes: Probes,
 }
 
 /// Predicts a run of batches.
@@ -47,11 +45,7 @@ pub fn foresee(
         shape,
         first_row: 0,
         instead: "take fewer or smaller frames",
-        procedure: Box::new(BatchesRun {
-            rig: rig.clone(),
-            task: Arc::new(task),
-            probes: lab.probes.clone(),
-        }),
+        procedure: Box::new(BatchesRun { rig: rig.clone(), task: Arc::new(task) }),
     })
 }
 
@@ -74,10 +68,9 @@ impl Measurement for BatchesRun {
     }
 
     fn measure(self: Box<Self>, run: Run) -> Result<Ended, RunError> {
-        let Self { rig, task, probes } = *self;
+        let Self { rig, task } = *self;
         let orders = run.orders.clone();
-        let Acquired { session, mut ledger, mut problems, fault, final_s } =
-            acquire(&rig, &task, &probes, run)?;
+        let Acquired { session, mut ledger, mut problems, fault, final_s } = acquire(&rig, &task, run)?;
         let state = end_state(fault.as_ref(), &orders);
         let mut products = None;
         if state == EndState::Complete {

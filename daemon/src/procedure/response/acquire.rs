@@ -46,7 +46,8 @@ pub struct Recorded {
 pub fn acquire(rig: &DotRig, task: &Arc<ResponseTask>, mut run: Run) -> Result<Recorded, RunError> {
     run.note_beginning()?;
     let rate_hz = task.response.camera_rate_hz;
-    let DotDevices { mut camera, mirror, stand, clock, pace, .. } = rig.open(&run.data, rate_hz)?;
+    let opened = rig.open(&run.data, rate_hz)?;
+    let DotDevices { mut camera, mirror, stand, clock, pace, .. } = run.probes.instead_of_dots(opened);
     let mut motion = Motion::new(mirror);
     let found = (camera.capabilities().height, camera.capabilities().width);
     let expected = (task.shape.height(), task.shape.width());

@@ -50,8 +50,8 @@ pub fn settings(rig: &DotRig, plan: &ViewfinderPlan) -> CameraSettings {
 /// # Errors
 /// When a device fails, or light is not permitted.
 pub fn view(rig: &DotRig, plan: &ViewfinderPlan, run: &Run) -> Result<(), RunError> {
-    let DotDevices { mut camera, mirror, stand, clock, pace, .. } =
-        rig.open(&run.data, plan.camera_rate_hz)?;
+    let opened = rig.open(&run.data, plan.camera_rate_hz)?;
+    let DotDevices { mut camera, mirror, stand, clock, pace, .. } = run.probes.instead_of_dots(opened);
     let mut motion = Motion::new(mirror);
     let (orders, capabilities) = (&*run.orders, camera.capabilities().clone());
     let (size, format) = ((capabilities.height, capabilities.width), capabilities.format);
