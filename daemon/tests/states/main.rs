@@ -58,6 +58,7 @@ enum Step {
     CameraIsGone,
     WatcherIsGone,
     ProjectorIsGone,
+    MirrorIsGone,
     DiskFails,
     /// All devices and the disk are there again.
     Mended,
@@ -77,6 +78,7 @@ fn steps() -> impl Strategy<Value = Vec<Step>> {
         1 => Just(Step::CameraIsGone),
         1 => Just(Step::WatcherIsGone),
         1 => Just(Step::ProjectorIsGone),
+        1 => Just(Step::MirrorIsGone),
         1 => Just(Step::DiskFails),
         3 => Just(Step::Mended),
     ];
@@ -183,6 +185,7 @@ fn conduct(kind: RigKind, steps: &[Step]) -> BTreeSet<String> {
                 Step::CameraIsGone => Faults::begin(&laboratory.faults.camera),
                 Step::WatcherIsGone => Faults::begin(&laboratory.faults.watcher),
                 Step::ProjectorIsGone => Faults::begin(&laboratory.faults.projector),
+                Step::MirrorIsGone => Faults::begin(&laboratory.faults.mirror),
                 Step::DiskFails => laboratory.block_disk(last.as_deref()),
                 Step::Mended => laboratory.mend(),
                 Step::ShutDown => {
@@ -288,7 +291,7 @@ fn random_requests_and_faults_with_an_operator_end_in_order() {
 }
 
 #[test]
-fn random_requests_on_a_dot_rig_end_in_order() {
+fn random_requests_and_faults_on_a_dot_rig_end_in_order() {
     sequences(RigKind::Dots);
 }
 

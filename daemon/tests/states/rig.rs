@@ -7,11 +7,12 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use raysweep::control::Control;
-use raysweep::rig::{AnyRig, Devices};
+use raysweep::rig::{AnyRig, Devices, DotDevices};
 use raysweep::{Probes, Runner};
 use raysweep_core::{
     Applied, Camera, CameraCapabilities, CameraSettings, DeviceError, DeviceErrorKind, DeviceState, Edge,
-    FrameBuf, FrameStamp, Pattern, Projector, SettingsId, Shown, Vsync,
+    FrameBuf, FrameStamp, Mirror, MirrorCapabilities, MirrorPath, MirrorProgress, Pattern, Projector,
+    SettingsId, Shown, Vsync,
 };
 use tempfile::TempDir;
 
@@ -62,6 +63,7 @@ pub struct Faults {
     pub camera: AtomicBool,
     pub watcher: AtomicBool,
     pub projector: AtomicBool,
+    pub mirror: AtomicBool,
 }
 
 impl Faults {
@@ -110,12 +112,43 @@ impl Camera for Unpluggable<Box<dyn Camera>> {
         buf: &mut FrameBuf,
         timeout: Duration,
     ) -> Result<Option<FrameStamp>, DeviceError> {
+        // Read first, as a virtual clock stops if nobody reads the camera.
+        let frame = self.device.next_frame(buf, timeout);
         Faults::check(&self.faults.camera, "camera")?;
-        self.device.next_frame(buf, timeout)
+        frame
     }
 
     fn disarm(&mut self) -> Result<(), DeviceError> {
         self.device.disarm()
+    }
+}
+
+impl Mirror for Unpluggable<Box<dyn Mirror>> {
+    fn capabilities(&self) -> &MirrorCapabilities {
+        self.device.capabilities()
+    }
+
+    fn load(&mut self, path: &MirrorPath) -> Result<f64, DeviceError> {
+        Faults::check(&self.faults.mirror, "mirror")?;
+        self.device.load(path)
+    }
+
+    fn start(&mut self, batches: u32) -> Result<(), DeviceError> {
+        Faults::check(&self.faults.mirror, "mirror")?;
+        *self.is_lit.lock().unwrap() = true;
+        self.device.start(batches)
+    }
+
+    fn feed(&mut self) -> Result<MirrorProgress, DeviceError> {
+        Faults::check(&self.faults.mirror, "mirror")?;
+        self.device.feed()
+    }
+
+    /// A mirror that is gone has no light either.
+    fn park(&mut self) -> Result<(), DeviceError> {
+        self.device.park()?;
+        *self.is_lit.lock().unwrap() = false;
+        Faults::check(&self.faults.mirror, "mirror")
     }
 }
 
@@ -177,10 +210,23 @@ impl Laboratory {
                 ..devices
             }
         };
+        let (unpluggable, lit) = (faults.clone(), is_lit.clone());
+        let dot_devices = move |devices: DotDevices| {
+            let (faults, is_lit) = (unpluggable.clone(), lit.clone());
+            let camera =
+                Unpluggable { device: devices.camera, faults: faults.clone(), is_lit: is_lit.clone() };
+            let mirror = devices.mirror.map(|device| Unpluggable { device, faults, is_lit });
+            DotDevices {
+                camera: Box::new(camera),
+                mirror: mirror.map(|mirror| Box::new(mirror) as Box<dyn Mirror>),
+                ..devices
+            }
+        };
         // Long enough for an order while a run is prepared.
         let preparing = || std::thread::sleep(Duration::from_millis(5));
         let probes = Probes {
             devices: Some(Arc::new(devices)),
+            dot_devices: Some(Arc::new(dot_devices)),
             preparing: Some(Arc::new(preparing)),
             ..Probes::default()
         };
@@ -210,7 +256,8 @@ impl Laboratory {
 
     /// All devices and the disk are there again.
     pub fn mend(&self) {
-        for device in [&self.faults.camera, &self.faults.watcher, &self.faults.projector] {
+        let Faults { camera, watcher, projector, mirror } = &*self.faults;
+        for device in [camera, watcher, projector, mirror] {
             device.store(false, Ordering::Relaxed);
         }
         for (place, away) in self.away.lock().unwrap().drain(..) {
@@ -220,7 +267,7 @@ impl Laboratory {
 
     /// Whether no device gives light, and the mirror is at its origin.
     pub fn is_dark(&self) {
-        assert!(!*self.is_lit.lock().unwrap(), "the projector is lit");
+        assert!(!*self.is_lit.lock().unwrap(), "{:?}: the projector or the mirror is lit", self.kind);
         if let Some(mirror) = self.runner.status().mirror {
             assert!(mirror.parked && !mirror.laser, "{:?}: {mirror:?}", self.kind);
         }

@@ -10,6 +10,8 @@ use crate::rig::Pace;
 
 /// Timeout of one wait for a frame.
 const POLL: Duration = Duration::from_millis(100);
+/// How long a camera that failed is left alone.
+const REST: Duration = Duration::from_millis(1);
 /// A camera without frames for this long has lost its trigger. Measured in host time, because a virtual clock runs on
 /// while another thread is about to start the mirror.
 const PATIENCE: Duration = Duration::from_secs(5);
@@ -57,10 +59,14 @@ impl From<QueueError<Arrival>> for FrameRefused {
 }
 
 impl Source<'_> {
-    /// Reads and discards frames until `is_over`, or until the camera fails.
+    /// Reads and discards frames until `is_over`, whatever the camera says.
     pub fn idle(&mut self, is_over: &dyn Fn() -> bool) {
         let mut data = self.pool.spare();
-        while !is_over() && self.camera.next_frame(&mut data, POLL).is_ok() {}
+        while !is_over() {
+            if self.camera.next_frame(&mut data, POLL).is_err() {
+                std::thread::sleep(REST);
+            }
+        }
     }
 
     /// Takes frames as long as `wanted` asks for them and hands them to `deliver`; returns what was lost after the
