@@ -30,10 +30,16 @@ pub const PLANS: [&str; 5] = [
     "kind = \"darks\"\n[darks]\nexposure_us = [50, 100]\nframes = 100\n",
     "kind = \"viewfinder\"\n[viewfinder]\npictures_per_s = 30\n",
 ];
-const BATCHES: &str = "kind = \"batches\"\nproduct = [{ kind = \"floodlit\" }]\n[batches]\ncount = 4\ndots = 60\n\
-                           exposure_us = 100\ndark_frames = 64\ntrailing_region = [112, 128, 48, 80]\n\
-                           background_indices = [0]\ncalibration = []\n[batches.path]\nshape = \"lissajous\"\n\
-                           cycles = [7, 1]\namplitude_deg = [2.3, 1.3]\nsamples = 1500\nrate_hz = 30000\n";
+/// Plans of the dot rig.
+const DOT_PLANS: [&str; 3] = [
+    "kind = \"batches\"\nproduct = [{ kind = \"floodlit\" }]\n[batches]\ncount = 4\ndots = 60\n\
+     exposure_us = 100\ndark_frames = 64\ntrailing_region = [112, 128, 48, 80]\n\
+     background_indices = [0]\ncalibration = []\n[batches.path]\nshape = \"lissajous\"\n\
+     cycles = [7, 1]\namplitude_deg = [2.3, 1.3]\nsamples = 1500\nrate_hz = 30000\n",
+    "kind = \"response\"\n[response]\nchirp_s = 0.2\nrest_s = 0.1\nrate_hz = 30000\n\
+     camera_rate_hz = 4000\nexposure_us = 100\ndark_frames = 64\nregion = [0, 112, 0, 128]\n",
+    "kind = \"viewfinder\"\n[viewfinder]\npictures_per_s = 30\n",
+];
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RigKind {
@@ -52,7 +58,7 @@ impl RigKind {
             Self::Operated => {
                 PLANS[number].replace("average = 150", "average = 3").replace("frames = 100", "frames = 3")
             }
-            Self::Dots => BATCHES.to_owned(),
+            Self::Dots => DOT_PLANS[number % DOT_PLANS.len()].to_owned(),
         }
     }
 }
