@@ -249,13 +249,16 @@ impl Laboratory {
         self.folder.path().join("sessions")
     }
 
-    /// Takes the places of a session's images away, so that none can be written.
+    /// Takes the places of a session's images away and puts files in their way, so that none can be written.
     pub fn block_disk(&self, session: Option<&Path>) {
         let Some(session) = session else { return };
         for array in ["stack.zarr/sum", "stack.zarr/dark", "film.zarr/film"] {
-            let (place, away) = (session.join(array), session.join(array).with_extension("away"));
-            if fs::rename(&place, &away).is_ok() {
-                self.away.lock().unwrap().push((place, away));
+            let mut moved = self.away.lock().unwrap();
+            let (place, away) =
+                (session.join(array), self.folder.path().join(format!("away-{}", moved.len())));
+            if place.is_dir() && fs::rename(&place, &away).is_ok() {
+                fs::write(&place, "").unwrap();
+                moved.push((place, away));
             }
         }
     }
@@ -267,6 +270,7 @@ impl Laboratory {
             device.store(false, Ordering::Relaxed);
         }
         for (place, away) in self.away.lock().unwrap().drain(..) {
+            fs::remove_file(&place).unwrap();
             fs::rename(away, place).unwrap();
         }
     }
