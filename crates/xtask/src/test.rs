@@ -5,9 +5,10 @@ use std::process::Command;
 use crate::run::{Done, cargo, run, target};
 use crate::{binaries, guest, packages, python, rootfs, space};
 
-/// What all of this command leaves in the target folder.
+/// The most that all of this command has on the disk of the target folder. Where temporary files are on it too, they are
+/// gone before the guests' disks are made.
 const TARGET_GIB: u64 = 11;
-/// What tests that run at once have in the folder for temporary files.
+/// What tests that run at once have in the folder for temporary files; and what is built anew after a small change.
 const TEMPORARY_GIB: u64 = 2;
 
 /// Whether to run the tests in virtual machines.
@@ -38,8 +39,9 @@ pub fn test(wanted: Guest) -> Done {
     tested?;
     match wanted {
         Guest::Run => {
-            let drivers = guest::guest(&[]);
-            guest::systemd::systemd().and(drivers)
+            let errors = [guest::guest(&[]), guest::systemd::systemd()].into_iter().filter_map(Result::err);
+            let errors: Vec<String> = errors.collect();
+            if errors.is_empty() { Ok(()) } else { Err(errors.join("\n")) }
         }
         Guest::Skip => {
             println!("{}", guest::skipped());
@@ -63,9 +65,11 @@ fn has_networks() -> Done {
 /// Fails where the build or the tests would fill the disk.
 fn has_space() -> Done {
     let target = target();
-    let missing_gib = TARGET_GIB.saturating_sub(space::taken_gib(&target));
-    space::require(&target, missing_gib, "what is built takes another")?;
-    space::require(&std::env::temp_dir(), TEMPORARY_GIB, "the tests write up to")
+    let missing_gib = TARGET_GIB.saturating_sub(space::taken_gib(&target)).max(TEMPORARY_GIB);
+    let remedy = "make room, or name a folder on another disk by CARGO_TARGET_DIR";
+    space::require(&target, missing_gib, "what is built takes another", remedy)?;
+    let remedy = "make room, or name a folder on another disk by TMPDIR";
+    space::require(&std::env::temp_dir(), TEMPORARY_GIB, "the tests write up to", remedy)
 }
 
 fn unshare_network() -> Done {

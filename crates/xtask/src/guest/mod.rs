@@ -63,7 +63,7 @@ pub fn guest(names: &[&str]) -> Done {
 pub fn skipped() -> String {
     let names: Vec<&str> = TESTS.iter().map(|test| test.name).collect();
     format!(
-        "kernel guest and systemd guest: SKIPPED (--no-guest); not tested under systemd: the package; against the kernel: {}",
+        "guests: SKIPPED (--no-guest); not tested: the package under systemd; against the kernel: {}",
         names.join(", ")
     )
 }

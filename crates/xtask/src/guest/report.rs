@@ -61,7 +61,7 @@ pub fn follow(machine: &mut Machine, run: &Path, names: &[&str], limit_s: u32) -
     if failures.is_empty() {
         Ok(checks)
     } else {
-        Err(format!("kernel guest: failed\n{}", failures.join("\n")))
+        Err(format!("a guest: failed\n{}", failures.join("\n")))
     }
 }
 

@@ -1,4 +1,6 @@
 echo "newest session: $(newest), $(points) points"
+interrupted() { ! is_complete; }
+check "the power was cut off in the middle of the run" interrupted
 systemctl start multi-user.target
 readable() { as ada raysweep sessions; }
 check "after a power failure sessions are readable" readable

@@ -6,16 +6,6 @@ installs() {
     dpkg -i /share/raysweep.deb && await is_active && systemctl --quiet is-enabled raysweepd.socket raysweepd.service
 }
 check "the package installs, and its simulated rig serves" installs
-# A smaller scene, as each start builds it.
-cp /share/rig.toml /etc/raysweep/rig.toml
-useradd -m -G raysweep ada
-useradd -m eve
-operator_at_once() { systemctl stop raysweepd.service && code 0 as ada raysweep status && await is_active; }
-check "a member of the group uses it at once: the socket starts the daemon" operator_at_once
-observer() { code 0 as eve raysweep status && code 5 as eve raysweep run /share/plan.toml && code 5 as eve raysweep cancel; }
-check "any other user may look, and is refused orders" observer
-buffers() { [ "$(cat /proc/sys/net/core/rmem_max)" -ge 16777216 ]; }
-check "rmem_max acts without a reboot" buffers
 examples() {
     folder=/usr/share/doc/raysweep/examples
     ! grep -r "tests/data" $folder /etc/raysweep || return 1
@@ -26,6 +16,16 @@ examples() {
     [ -e $folder/scenes/p2r_corner.npz ] && [ -e $folder/plans/quick.toml ]
 }
 check "examples name only what is installed" examples
+# A smaller scene, as each start builds it.
+cp /share/rig.toml /etc/raysweep/rig.toml
+useradd -m -G raysweep ada
+useradd -m eve
+operator_at_once() { systemctl stop raysweepd.service && code 0 as ada raysweep status && await is_active; }
+check "a member of the group uses it at once: the socket starts the daemon" operator_at_once
+observer() { code 0 as eve raysweep status && code 5 as eve raysweep run /share/plan.toml && code 5 as eve raysweep cancel; }
+check "any other user may look, and is refused orders" observer
+buffers() { [ "$(cat /proc/sys/net/core/rmem_max)" -ge 16777216 ]; }
+check "rmem_max acts without a reboot" buffers
 pages() { zgrep -q "raysweep" /usr/share/man/man1/raysweep-run.1.gz /usr/share/man/man8/raysweepd.8.gz; }
 check "manual pages are there" pages
 
@@ -124,9 +124,9 @@ stopped() {
 check "a stop ends the run in order, and resume completes it to the same bits" stopped
 
 watchdog() {
-    printf '[Service]\nWatchdogSec=5\n' >/etc/systemd/system/raysweepd.service.d/watchdog.conf
+    printf '[Service]\nWatchdogSec=10\n' >/etc/systemd/system/raysweepd.service.d/watchdog.conf
     systemctl daemon-reload && systemctl restart raysweepd.service && pid=$(property MainPID)
-    sleep 7
+    sleep 12
     [ "$(property MainPID)" = "$pid" ] || return 1
     begin && kill -STOP "$pid" && code 4 wait $client && await is_active && await is_complete && same_bits || return 1
     journalctl -u raysweepd.service | grep -q "result 'watchdog'"
