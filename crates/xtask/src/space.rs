@@ -1,11 +1,12 @@
-//! Room on a disk, looked for before half an hour's work rather than missed in the middle of it.
+//! Room on a disk, looked for before a long work rather than missed in its middle.
 
 use std::path::Path;
 use std::process::Command;
 
 use crate::run::Done;
 
-const GIB: u64 = 1 << 30;
+/// Bytes of a gibibyte.
+pub const GIB: u64 = 1 << 30;
 
 /// Fails where the disk of a folder, which need not be there yet, has less than `needed_gib` left: `why` says for what it
 /// is needed, and `remedy` what to do.
@@ -22,15 +23,15 @@ pub fn require(folder: &Path, needed_gib: u64, why: &str, remedy: &str) -> Done 
 
 /// What the disk of a folder has left; unknown where there is no `df` like GNU's.
 fn free_bytes(folder: &Path) -> Option<u64> {
+    let folder = std::path::absolute(folder).ok()?;
     let present = folder.ancestors().find(|folder| folder.exists())?;
     number(Command::new("df").args(["--block-size=1", "--output=avail"]).arg(present))
 }
 
-/// What a folder takes of its disk, in whole gibibytes.
-pub fn taken_gib(folder: &Path) -> u64 {
+/// What a folder takes of its disk; 0 if it is not there.
+pub fn taken_bytes(folder: &Path) -> u64 {
     let mut du = Command::new("du");
-    number(du.args(["--summarize", "--dereference-args", "--block-size=1"]).arg(folder))
-        .map_or(0, |it| it / GIB)
+    number(du.args(["--summarize", "--dereference-args", "--block-size=1"]).arg(folder)).unwrap_or(0)
 }
 
 /// The number that a program prints: in its last line, first. Files that vanish meanwhile are no reason to ask for it
@@ -58,10 +59,15 @@ mod tests {
     #[test]
     fn what_a_folder_takes_is_what_its_files_have() {
         let folder = std::env::temp_dir().join(format!("raysweep-space-{}", std::process::id()));
-        std::fs::create_dir_all(&folder).unwrap();
-        assert_eq!((taken_gib(&folder), taken_gib(Path::new("/does/not/exist"))), (0, 0));
-        let said = number(Command::new("du").args(["--summarize", "--block-size=1"]).arg(&folder));
-        assert!(said.is_some_and(|bytes| bytes < GIB), "{said:?}");
+        let _ = std::fs::remove_dir_all(&folder);
+        std::fs::create_dir_all(folder.join("kept")).unwrap();
+        std::fs::write(folder.join("kept/file"), vec![1; 1 << 20]).unwrap();
+        std::os::unix::fs::symlink(folder.join("kept"), folder.join("link")).unwrap();
+        for name in ["kept", "link"] {
+            let taken_bytes = taken_bytes(&folder.join(name));
+            assert!((1 << 20..2 << 20).contains(&taken_bytes), "{name}: {taken_bytes}");
+        }
+        assert_eq!(taken_bytes(&folder.join("nothing")), 0);
         std::fs::remove_dir_all(&folder).unwrap();
     }
 }

@@ -82,12 +82,12 @@ pub enum RunError {
     },
     /// A thread of the run has ended unexpectedly; another error says which and why.
     #[error(
-        "a thread of the run has ended unexpectedly; see the log. The stored data are kept: resume the session (films and batches: `raysweep process` it)"
+        "a thread of the run has ended unexpectedly; see the log. The stored data are kept: resume a sweep, patterns, darks or a calibration; `raysweep process` a film or batches"
     )]
     Interrupted,
     /// The run panicked, which is a bug.
     #[error(
-        "the run panicked, which is a bug: {0}. The stored data are kept: resume the session (films and batches: `raysweep process` it)"
+        "the run panicked, which is a bug: {0}. The stored data are kept: resume a sweep, patterns, darks or a calibration; `raysweep process` a film or batches"
     )]
     Panicked(String),
 }

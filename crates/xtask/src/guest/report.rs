@@ -58,11 +58,7 @@ pub fn follow(machine: &mut Machine, run: &Path, names: &[&str], limit_s: u32) -
             }
         }
     }
-    if failures.is_empty() {
-        Ok(checks)
-    } else {
-        Err(format!("a guest: failed\n{}", failures.join("\n")))
-    }
+    if failures.is_empty() { Ok(checks) } else { Err(format!("checks failed\n{}", failures.join("\n"))) }
 }
 
 /// Returns the line if it reports the end of a check: `test name ... ok`.

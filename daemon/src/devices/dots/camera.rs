@@ -1,5 +1,6 @@
 //! The camera's part: passes frames from the camera to the pipeline, and accounts for every exposure that is lost.
 
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::{Duration, Instant};
 
 use raysweep_core::{Camera, DeviceError, DeviceErrorKind, DeviceState, Frame, FramePool, LossCause};
@@ -59,11 +60,12 @@ impl From<QueueError<Arrival>> for FrameRefused {
 }
 
 impl Source<'_> {
-    /// Reads and discards frames until `is_over`, whatever the camera says.
+    /// Reads and discards frames until `is_over`, whatever the camera does.
     pub fn idle(&mut self, is_over: &dyn Fn() -> bool) {
         let mut data = self.pool.spare();
         while !is_over() {
-            if self.camera.next_frame(&mut data, POLL).is_err() {
+            let read = catch_unwind(AssertUnwindSafe(|| self.camera.next_frame(&mut data, POLL)));
+            if !matches!(read, Ok(Ok(_))) {
                 std::thread::sleep(REST);
             }
         }

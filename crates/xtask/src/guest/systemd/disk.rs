@@ -88,7 +88,7 @@ fn debian(folder: &Path) -> Done<PathBuf> {
     let mut make = Command::new("mmdebstrap");
     // On disk it takes three times as long.
     let memory = Path::new("/dev/shm");
-    if memory.is_dir() && space::require(memory, 1, "", "").is_ok() {
+    if memory.is_dir() && space::require(memory, 1, "a Debian takes up to", "mount a larger one").is_ok() {
         make.env("TMPDIR", "/dev/shm");
     }
     make.args(["--quiet", "--variant=custom", "--include=?essential", &format!("--include={PACKAGES}")]);

@@ -81,10 +81,11 @@ score() { systemd-analyze security --no-pager raysweepd.service | sed -n 's/.*Ov
 at_most() { echo "exposure $1, at most $2"; [ -n "$1" ] && [ "$(printf '%s\n' "$1" "$2" | sort -n | tail -n 1)" = "$2" ]; }
 check "exposure of the unit" at_most "$(score)" 2.0
 unusable() {
+    systemctl reset-failed raysweepd.service
     echo 'kind = "cube"' >/etc/raysweep/rig.toml
     ! systemctl restart raysweepd.service || return 1
     restarts=$(property NRestarts)
-    code 4 timeout 60 runuser -u ada -- raysweep status || return 1
+    code 4 timeout 300 runuser -u ada -- raysweep status || return 1
     [ "$(property NRestarts)" = "$restarts" ] && journalctl -u raysweepd.service -p err -o cat | grep "rig.toml"
 }
 check "an unusable rig file: an error in the journal, no restart, and clients are told" unusable
@@ -92,7 +93,7 @@ missing() {
     rm /etc/raysweep/rig.toml
     systemctl reset-failed raysweepd.service raysweepd.socket
     systemctl restart raysweepd.socket
-    code 4 timeout 60 runuser -u ada -- raysweep status && [ "$(property ActiveState)" = failed ] &&
+    code 4 timeout 300 runuser -u ada -- raysweep status && [ "$(property ActiveState)" = failed ] &&
         journalctl -u raysweepd.service -p err -o cat | grep "rig.toml.*No such file"
 }
 check "no rig file: the same" missing
@@ -112,6 +113,7 @@ rm /etc/systemd/system/raysweepd.service.d/*.conf
 systemctl daemon-reload
 
 crash() {
+    systemctl reset-failed raysweepd.service
     begin && pid=$(property MainPID) && kill -9 "$pid" && code 4 wait $client && await is_active &&
         [ "$(property MainPID)" != "$pid" ] && await is_complete && same_bits
 }
