@@ -180,25 +180,95 @@ fn a_slow_disk_changes_no_bit() {
     assert!(outcome(&begun.session) == begun.whole, "other bits");
 }
 
-#[test]
-fn a_film_on_a_full_disk_is_held_between_two_cycles_and_loses_none() {
+/// Runs a plan in a folder of its own while `strace` tampers with calls that concern a file of its session, which is named
+/// after the second in which it begins and the plan's name.
+fn tampered_run(rig: &str, plan: &str, name: &str, file: &str, tamper: &str) -> (TempDir, PathBuf, Ended) {
     let folder = tempfile::tempdir_in("/dev/shm").unwrap();
-    std::fs::write(folder.path().join("rig.toml"), RIG).unwrap();
-    // A film cannot be resumed, so its folder is not known before: it is named after the second in which it begins.
+    std::fs::write(folder.path().join("rig.toml"), rig).unwrap();
     let stamp = |second| {
         let begins = jiff::Timestamp::now() + jiff::SignedDuration::from_secs(second);
         let stamp = begins.to_zoned(jiff::tz::TimeZone::UTC).strftime("%Y%m%d-%H%M%S").to_string();
-        folder.path().join(format!("sessions/{stamp}_film/film.zarr/film/c.3.0.0.0.raysweep-tmp"))
+        folder.path().join(format!("sessions/{stamp}_{name}/{file}"))
     };
     let files: Vec<PathBuf> = (0..600).map(stamp).collect();
-    let command = tampered("fsync:error=ENOSPC:when=1", &files);
+    let command = tampered(tamper, &files);
     let mut daemon = Begun::daemon(folder.path(), command);
     let (events, mut client) = Begun::clients(folder.path(), &mut daemon);
-    let plan =
-        "kind = \"film\"\nname = \"film\"\n[film]\ncycles = 6\ndelay_us = [-60, 0, 60]\nexposure_us = 50\n";
-    let session = client.run(&RunParams { plan: plan.into(), ..RunParams::default() }).unwrap().session;
+    let plan = format!("name = \"{name}\"\n{plan}");
+    let session = client.run(&RunParams { plan, ..RunParams::default() }).unwrap().session;
     let ended = ended(events, &mut client, |_| {});
+    (folder, session, ended)
+}
+
+#[test]
+fn a_film_on_a_full_disk_is_held_between_two_cycles_and_loses_none() {
+    let plan = "kind = \"film\"\n[film]\ncycles = 6\ndelay_us = [-60, 0, 60]\nexposure_us = 50\n";
+    let file = "film.zarr/film/c.3.0.0.0.raysweep-tmp";
+    let (_folder, session, ended) = tampered_run(RIG, plan, "film", file, "fsync:error=ENOSPC:when=1");
     assert_eq!((ended.state.as_str(), ended.waited_for.len()), ("complete", 1), "{ended:?}");
     let state = raysweep_session::Session::open(&session).unwrap().state().unwrap();
     assert_eq!(state.cycles().count(), 6);
+}
+
+const DOTS: &str = "kind = \"dots\"\n[camera]\ndriver = \"sim\"\n[mirror]\ndriver = \"sim\"\n\
+                    [sim.dots]\nscene = \"v-groove\"\nrows = 112\ncolumns = 128\nmargin_rows = 16\nseed = 5\n";
+
+#[test]
+fn batches_on_a_full_disk_are_held_and_none_is_lost() {
+    let plan = "kind = \"batches\"\nproduct = [{ kind = \"floodlit\" }]\n\
+                [batches]\ncount = 6\ndots = 300\nexposure_us = 100\ndark_frames = 64\nkeep_raw = true\n\
+                trailing_region = [112, 128, 48, 80]\nbackground_indices = [0]\n\
+                [batches.path]\nshape = \"lissajous\"\ncycles = [7, 1]\namplitude_deg = [2.3, 1.3]\nsamples = 1500\n\
+                rate_hz = 30000\n";
+    // A batch that cannot be named, the last, a line, raw frames, and their places.
+    let cases = [
+        ("dots.zarr/b0002.raysweep-tmp", "rename:error=ENOSPC:when=1"),
+        ("dots.zarr/b0007.raysweep-tmp", "rename:error=ENOSPC:when=1..2"),
+        ("ledger.jsonl", "fdatasync:error=ENOSPC:when=5"),
+        ("raw.npy", "write:error=ENOSPC:when=1000"),
+        ("raw.csv", "write:error=ENOSPC:when=1"),
+    ];
+    std::thread::scope(|scope| {
+        for (file, tamper) in cases {
+            scope.spawn(move || {
+                let (_folder, session, ended) = tampered_run(DOTS, plan, "dots", file, tamper);
+                assert_eq!(ended.state, "complete", "{tamper}: {ended:?}");
+                // Each pass has a thread of its own for raw frames, and `strace` counts the calls of each thread.
+                assert!(!ended.waited_for.is_empty(), "{file}, {tamper}: {ended:?}");
+                let is_told = |text: &String| text.contains("No space") && text.contains("goes on by itself");
+                assert!(ended.waited_for.iter().all(is_told), "{tamper}: {ended:?}");
+                let session = raysweep_session::Session::open(&session).unwrap();
+                let state = session.state().unwrap();
+                assert_eq!(
+                    state.batches().map(|entry| entry.batch).collect::<Vec<_>>(),
+                    (0..8).collect::<Vec<_>>()
+                );
+                assert!(state.batches().all(|entry| entry.missing.is_empty()), "{file}");
+                assert!(state.counts.balanced() && state.counts.lost_total() == 0, "{:?}", state.counts);
+                // Each raw frame is there once, and has its line.
+                let bytes = std::fs::metadata(session.raw_path()).unwrap().len() - 128;
+                assert_eq!(bytes % (2 * 128 * 128), 0, "{file}");
+                let lines = std::fs::read_to_string(session.raw_path().with_extension("csv")).unwrap();
+                let mut noted: Vec<usize> = lines
+                    .lines()
+                    .skip(1)
+                    .map(|line| line.split_once(',').unwrap().0.parse().unwrap())
+                    .collect();
+                noted.sort_unstable();
+                assert!(noted.into_iter().eq(0..bytes as usize / (2 * 128 * 128)), "{file}");
+            });
+        }
+    });
+}
+
+#[test]
+fn a_chirp_on_a_full_disk_is_held_and_none_is_lost() {
+    let plan = "kind = \"response\"\n[response]\nchirp_s = 0.5\nrest_s = 0.2\nrate_hz = 30000\n\
+                camera_rate_hz = 4000\nexposure_us = 100\ndark_frames = 64\nregion = [0, 112, 0, 128]\n";
+    let rig = format!("{DOTS}[sim.dots.mirror]\nf0_hz = [500.0, 480.0]\nq = [30.0, 22.0]\n");
+    let file = "products/chirp_x.npy.raysweep-tmp";
+    let (_folder, session, ended) = tampered_run(&rig, plan, "response", file, "fsync:error=ENOSPC:when=1");
+    assert_eq!((ended.state.as_str(), ended.waited_for.len()), ("complete", 1), "{ended:?}");
+    let state = raysweep_session::Session::open(&session).unwrap().state().unwrap();
+    assert_eq!(state.stored_points(), 2);
 }

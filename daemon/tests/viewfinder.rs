@@ -114,6 +114,9 @@ impl View {
     }
 }
 
+const DOTS: &str = "kind = \"dots\"\n[camera]\ndriver = \"sim\"\n[mirror]\ndriver = \"sim\"\n\
+                    [sim.dots]\nrows = 36\ncolumns = 64\n";
+
 /// A projector that notes what it is told.
 struct Spied {
     inner: Box<dyn Projector>,
@@ -198,6 +201,17 @@ fn it_ends_with_the_daemon_and_after_its_time_with_the_light_off() {
     let mut view = View::new(PLANE, "seconds = 0.2\n");
     assert_eq!(view.end(), ("complete".into(), None));
     assert_eq!(view.told.lock().unwrap().last(), Some(&None));
+}
+
+#[test]
+fn a_paused_one_ends_after_its_time_too() {
+    for rig in [PLANE, DOTS] {
+        let mut view = View::new(rig, "seconds = 2\n");
+        view.picture(|_| true);
+        view.runner.pause().unwrap();
+        assert_eq!(view.runner.status().state, RunState::Paused);
+        assert_eq!(view.end(), ("complete".into(), None));
+    }
 }
 
 #[test]
@@ -327,8 +341,7 @@ fn the_align_aid_measures_a_misalignment_to_a_tenth_of_a_row() {
 
 #[test]
 fn the_dot_of_a_dot_rig_has_its_place_size_and_peak() {
-    let rig = "kind = \"dots\"\n[camera]\ndriver = \"sim\"\n[mirror]\ndriver = \"sim\"\n[sim.dots]\nrows = 36\ncolumns = 64\n";
-    let mut view = View::new(rig, "");
+    let mut view = View::new(DOTS, "");
     let dot = view.picture(|values| values.dot.is_some()).dot.unwrap();
     println!("{dot:?}");
     // The rig's dot is 0.42 degrees wide, and its 9.27 degrees fill 64 columns. The mirror at rest points at the middle,
@@ -349,7 +362,7 @@ fn the_dot_of_a_dot_rig_has_its_place_size_and_peak() {
     );
     view.runner.cancel().unwrap();
     assert_eq!(view.end(), ("complete".into(), None));
-    let mut tilted = View::new(rig, "tilt_deg = [1.0, 0.0]\n");
+    let mut tilted = View::new(DOTS, "tilt_deg = [1.0, 0.0]\n");
     let moved = tilted.picture(|values| values.dot.is_some()).dot.unwrap();
     assert!((moved.column - dot.column).abs() > 3.0, "{dot:?} and {moved:?}");
 }

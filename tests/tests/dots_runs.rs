@@ -7,12 +7,14 @@ use std::collections::HashMap;
 use std::path::Path;
 use std::process::Command;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, Mutex, OnceLock};
 use std::time::Duration;
 
 use ndarray::{Array2, Array3, Array4, Axis, Zip, concatenate, s};
 use raysweep::control::Control;
+use raysweep::rig::DotDevices;
 use raysweep::{Probes, Runner};
+use raysweep_core::{DeviceError, Mirror, MirrorCapabilities, MirrorPath, MirrorProgress};
 use raysweep_pipeline::dots::{ColumnStage, ColumnWorker};
 use raysweep_processing::process;
 use raysweep_proto::{RunParams, RunState};
@@ -271,39 +273,112 @@ impl ColumnWorker for TrapWorker {
     }
 }
 
-/// A bench whose stage calls `spring` before it denoises, at the given frame of the passes with light.
-fn trapped(rig: &str, frame: usize, spring: fn(&Runner)) -> Bench {
+/// A mirror, and the last that was asked of it, feeding left out.
+struct Watched(Box<dyn Mirror>, Arc<Mutex<&'static str>>);
+
+impl Mirror for Watched {
+    fn capabilities(&self) -> &MirrorCapabilities {
+        self.0.capabilities()
+    }
+
+    fn load(&mut self, path: &MirrorPath) -> Result<f64, DeviceError> {
+        self.0.load(path)
+    }
+
+    fn start(&mut self, batches: u32) -> Result<(), DeviceError> {
+        *self.1.lock().unwrap() = "start";
+        self.0.start(batches)
+    }
+
+    fn feed(&mut self) -> Result<MirrorProgress, DeviceError> {
+        self.0.feed()
+    }
+
+    fn park(&mut self) -> Result<(), DeviceError> {
+        self.0.park()?;
+        *self.1.lock().unwrap() = "park";
+        Ok(())
+    }
+}
+
+/// A bench whose stage calls `spring` before it denoises, at the given frame of the passes with light; and the last that
+/// was asked of its mirror.
+fn trapped(rig: &str, frame: usize, spring: fn(&Runner)) -> (Bench, Arc<Mutex<&'static str>>) {
+    let asked = Arc::new(Mutex::new(""));
+    let watched = asked.clone();
+    let instead = move |mut devices: DotDevices| {
+        let mirror = devices.mirror.take().map(|mirror| Watched(mirror, watched.clone()));
+        devices.mirror = mirror.map(|mirror| Box::new(mirror) as Box<dyn Mirror>);
+        devices
+    };
     let shared = Arc::new(Shared { frames_left: AtomicUsize::new(frame), runner: OnceLock::new(), spring });
     let around = {
         let shared = shared.clone();
         move |inner| Arc::new(Trap { inner, shared: shared.clone() }) as Arc<dyn ColumnStage>
     };
-    let probes = Probes { column_stage: Some(Arc::new(around)), ..Probes::default() };
+    let probes = Probes {
+        column_stage: Some(Arc::new(around)),
+        dot_devices: Some(Arc::new(instead)),
+        ..Probes::default()
+    };
     let bench = Bench::dots_with_probes(rig, probes);
     assert!(shared.runner.set(bench.runner.clone()).is_ok());
-    bench
+    (bench, asked)
+}
+
+/// Where the brightest pixel of each dot is in a batch; `None` for a dot without light.
+fn places(ended: &Ended, batch: usize) -> Vec<Option<usize>> {
+    let columns = ended.open().0.dots().unwrap().read(batch).unwrap();
+    let mut values = columns.values.iter();
+    let dots = columns.word_offsets.windows(2).map(|range| {
+        let words = range[0] as usize..range[1] as usize;
+        let pixels = words.flat_map(|word| {
+            let (at, mask) = (columns.words[word] as usize * 32, columns.masks[word]);
+            (0..32).filter(move |bit| mask >> bit & 1 == 1).map(move |bit| at + bit)
+        });
+        let lit = pixels.zip(values.by_ref().copied()).collect::<Vec<_>>();
+        lit.into_iter().max_by(|a, b| a.1.total_cmp(&b.1)).map(|(pixel, _)| pixel)
+    });
+    dots.collect()
 }
 
 #[test]
-fn a_pause_in_mid_run_holds_before_the_next_pass_and_costs_nothing() {
+fn a_pause_parks_the_mirror_at_once_and_costs_no_batch() {
     let straight = Bench::dots(&rig(""));
     let through = completed(&straight, &plan(FLOODLIT, 2));
-    // In the second batch of the first plane.
-    let bench = trapped(&rig(""), 700, |runner| runner.pause().unwrap());
-    let mut events = bench.runner.events();
-    let plan = plan(FLOODLIT, 2);
-    bench.runner.run(RunParams { plan, ..RunParams::default() }).unwrap();
-    let stored = || bench.runner.status().progress.map_or(0, |progress| progress.points_stored);
-    wait_until(|| stored() == 2);
-    // Enough time for a run that does not pause to acquire the other plane.
-    std::thread::sleep(Duration::from_millis(500));
-    assert_eq!((bench.runner.status().state, stored()), (RunState::Paused, 2));
-    bench.runner.go_on().unwrap();
-    let held = end_of(&mut events);
-    assert_eq!(held.state, "complete", "{:?}", held.error);
-    assert_eq!(checksums(&held), checksums(&through));
-    let (of_held, of_through) = (held.open().1.counts, through.open().1.counts);
-    assert_eq!((of_held.lost_total(), of_held.averaged), (0, of_through.averaged));
+    let batches = |ended: &Ended| -> Vec<_> {
+        entries(ended).iter().map(|entry| (entry.batch, entry.plane, entry.missing.len())).collect()
+    };
+    // Before the first trailing dot, in the second batch of the first plane, at the end of its last, and in the scene;
+    // a pass plays two batches more than are asked for.
+    for (frame, expected) in [(10, 0), (700, 1), (1190, 2), (2 * 1200 + 800, 5)] {
+        let (bench, asked) = trapped(&rig(""), frame, |runner| runner.pause().unwrap());
+        let mut events = bench.runner.events();
+        let plan = plan(FLOODLIT, 2);
+        bench.runner.run(RunParams { plan, ..RunParams::default() }).unwrap();
+        wait_until(|| bench.runner.status().state == RunState::Paused && *asked.lock().unwrap() == "park");
+        // Enough time for a run that does not pause to acquire the rest.
+        std::thread::sleep(Duration::from_millis(500));
+        let stored = bench.runner.status().progress.map_or(0, |progress| progress.points_stored);
+        assert_eq!((bench.runner.status().state, *asked.lock().unwrap()), (RunState::Paused, "park"));
+        bench.runner.go_on().unwrap();
+        let held = end_of(&mut events);
+        assert_eq!(held.state, "complete", "{:?}", held.error);
+        assert_eq!(stored, expected, "at frame {frame}");
+        assert_eq!(batches(&held), batches(&through), "at frame {frame}");
+        for batch in 0..4 {
+            // Noise moves the brightest pixel at most to a neighbour, and neighbouring dots are further apart.
+            let moved =
+                places(&held, batch).into_iter().zip(places(&through, batch)).filter(|pair| match pair {
+                    (Some(a), Some(b)) => (a / 128).abs_diff(b / 128) > 1 || (a % 128).abs_diff(b % 128) > 1,
+                    (a, b) => a != b,
+                });
+            assert_eq!(moved.count(), 0, "at frame {frame}: dots of batch {batch} are elsewhere");
+        }
+        let (of_held, of_through) = (held.open().1.counts, through.open().1.counts);
+        assert!(of_held.balanced(), "{of_held:?}");
+        assert_eq!((of_held.lost_total(), of_held.averaged), (0, of_through.averaged));
+    }
 }
 
 #[test]
@@ -311,7 +386,7 @@ fn a_cancelled_run_makes_videos_of_the_batches_that_are_there() {
     let straight = Bench::dots(&rig(""));
     let through = completed(&straight, &plan(FLOODLIT, 6));
     // Both planes take four batches each of 300 dots; this frame is in the fourth batch of the scene.
-    let bench = trapped(&rig(""), 2 * 4 * 300 + 4 * 300 + 150, |runner| runner.cancel().unwrap());
+    let (bench, _) = trapped(&rig(""), 2 * 4 * 300 + 4 * 300 + 150, |runner| runner.cancel().unwrap());
     let ended = bench.run(&plan(FLOODLIT, 6));
     assert_eq!(ended.state, "cancelled", "{:?}", ended.error);
     let stored = checksums(&ended);

@@ -206,7 +206,8 @@ impl Dots {
 
 /// `raw.npy` and `raw.csv`: the raw frames of a flying dot in order of arrival, uint16 `[frame, t, s]`, and
 /// one line per frame with its number in the file, the camera's id, and its batch and dot, both empty if it
-/// belongs to none. Lines are written once that is certain, so they are not strictly in order. The header of
+/// belongs to none. Lines are written once that is certain, so they are not strictly in order. A batch that a pause cut
+/// short is taken again: of several frames of a dot, the last is in the batch. The header of
 /// a file that a crash cut short states 0 frames; its length tells how many there are.
 pub struct RawFrames {
     path: PathBuf,
@@ -214,6 +215,8 @@ pub struct RawFrames {
     lines: BufWriter<File>,
     size: [usize; 2],
     count: u64,
+    /// The frame that is written.
+    bytes: Vec<u8>,
 }
 
 /// Bytes of the header of `raw.npy`, for any number of frames.
@@ -225,13 +228,17 @@ impl RawFrames {
     /// # Errors
     /// [`Error::Io`] if the file system refuses.
     pub fn create(path: &Path, rows: usize, columns: usize) -> Result<Self> {
-        let make = |path: &Path| File::create(path).map(BufWriter::new).map_err(Error::io("create", path));
+        let make = |path: &Path| File::create(path).map_err(Error::io("create", path));
         let table = path.with_extension("csv");
-        let (mut frames, mut lines) = (make(path)?, make(&table)?);
         let size = [rows, columns];
+        // A frame has room in the buffer, so that a disk that is full refuses it whole.
+        let buffer_bytes = 2 * rows * columns + HEADER_BYTES;
+        let mut frames = BufWriter::with_capacity(buffer_bytes, make(path)?);
+        let mut lines = BufWriter::new(make(&table)?);
         frames.write_all(&header(0, size)).map_err(Error::io("write", path))?;
         lines.write_all(b"frame,id,batch,dot\n").map_err(Error::io("write", &table))?;
-        Ok(Self { path: path.to_owned(), frames, lines, size, count: 0 })
+        let bytes = Vec::with_capacity(2 * rows * columns);
+        Ok(Self { path: path.to_owned(), frames, lines, size, count: 0, bytes })
     }
 
     /// Number of frames so far.
@@ -244,7 +251,7 @@ impl RawFrames {
         self.count == 0
     }
 
-    /// Appends a frame, row by row.
+    /// Appends a frame, row by row. What the file system refuses can be tried again.
     ///
     /// # Errors
     /// [`Error::Shape`] for a frame of another size, [`Error::Io`] if the file system refuses.
@@ -258,25 +265,32 @@ impl RawFrames {
                 allowed: format!("[{}]", rows * columns),
             });
         }
-        let mut written = Ok(());
-        for row in frame.chunks(columns) {
-            let bytes: Vec<u8> = row.iter().flat_map(|counts| counts.to_le_bytes()).collect();
-            written = written.and_then(|()| self.frames.write_all(&bytes));
-        }
+        self.bytes.clear();
+        self.bytes.extend(frame.iter().flat_map(|counts| counts.to_le_bytes()));
+        self.frames.write_all(&self.bytes).map_err(Error::io("write", &self.path))?;
         self.count += 1;
-        written.map_err(Error::io("write", &self.path))
+        Ok(())
     }
 
-    /// Records which dot of which batch a frame shows.
+    /// Records which dot of which batch a frame shows. What the file system refuses can be tried again.
     ///
     /// # Errors
     /// [`Error::Io`] if the file system refuses.
     pub fn note(&mut self, frame: u64, id: u64, place: Option<(usize, usize)>) -> Result<()> {
-        let written = match place {
-            Some((batch, dot)) => writeln!(self.lines, "{frame},{id},{batch},{dot}"),
-            None => writeln!(self.lines, "{frame},{id},,"),
+        let line = match place {
+            Some((batch, dot)) => format!("{frame},{id},{batch},{dot}\n"),
+            None => format!("{frame},{id},,\n"),
         };
-        written.map_err(Error::io("write", &self.path.with_extension("csv")))
+        self.lines.write_all(line.as_bytes()).map_err(Error::io("write", &self.path.with_extension("csv")))
+    }
+
+    /// Hands everything to the file system. What it refuses can be tried again.
+    ///
+    /// # Errors
+    /// [`Error::Io`] if it refuses.
+    pub fn flush(&mut self) -> Result<()> {
+        let flushed = self.frames.flush().and_then(|()| self.lines.flush());
+        flushed.map_err(Error::io("write", &self.path))
     }
 
     /// Completes the files; when this returns, they are durable.
@@ -284,7 +298,7 @@ impl RawFrames {
     /// # Errors
     /// [`Error::Io`] if the file system refuses.
     pub fn finish(self) -> Result<()> {
-        let Self { path, frames, lines, size, count } = self;
+        let Self { path, frames, lines, size, count, .. } = self;
         for (file, header) in [(frames, Some(header(count, size))), (lines, None)] {
             let mut file =
                 file.into_inner().map_err(|error| Error::io("write", &path)(error.into_error()))?;

@@ -1,6 +1,6 @@
 //! `raysweep expose`: tries exposures on the scene with a viewfinder, and proposes a plan.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use raysweep_config::plan::{Axis, with_tables};
@@ -177,6 +177,9 @@ struct Trial {
     events: Subscription,
     interrupts: Interrupts,
     pictures: u64,
+    /// The viewfinder's session.
+    session: PathBuf,
+    is_over: bool,
 }
 
 impl Trial {
@@ -184,12 +187,9 @@ impl Trial {
         let mut events = Client::connect(socket)?.subscribe()?;
         let interrupts = Interrupts::of_any_end().map_err(CommandFailure::Signals)?;
         let client = Client::connect(socket)?;
-        events.client().run(&RunParams {
-            plan: VIEWFINDER.into(),
-            attached: true,
-            ..RunParams::default()
-        })?;
-        let mut trial = Self { client, events, interrupts, pictures: 0 };
+        let plan = RunParams { plan: VIEWFINDER.into(), attached: true, ..RunParams::default() };
+        let session = events.client().run(&plan)?.session;
+        let mut trial = Self { client, events, interrupts, pictures: 0, session, is_over: false };
         trial.picture(None)?;
         Ok(trial)
     }
@@ -261,7 +261,8 @@ impl Trial {
                         return Ok(*values);
                     }
                 }
-                Some(Event::Finished { error, .. }) => {
+                Some(Event::Finished { session, error, .. }) if session == self.session => {
+                    self.is_over = true;
                     let why = error.unwrap_or_else(|| "the viewfinder was ended".into());
                     return Err(CommandFailure::Exposure(why));
                 }
@@ -276,6 +277,9 @@ impl Trial {
 
 impl Drop for Trial {
     fn drop(&mut self) {
+        if self.is_over {
+            return;
+        }
         match self.client.cancel() {
             Ok(()) => {}
             Err(ClientError::Rpc(error)) if error.name() == Some(ErrorCode::NotRunning) => return,
@@ -284,7 +288,8 @@ impl Drop for Trial {
         let began = Instant::now();
         while began.elapsed() < PATIENCE {
             match self.events.next_within(Duration::from_millis(100)) {
-                Ok(Some(Event::Finished { .. })) | Err(ClientError::Lost { .. }) => return,
+                Ok(Some(Event::Finished { session, .. })) if session == self.session => return,
+                Err(ClientError::Lost { .. }) => return,
                 _ => {}
             }
         }

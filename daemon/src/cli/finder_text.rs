@@ -13,12 +13,10 @@ pub(super) fn line(values: &ViewfinderValues) -> String {
             FocusTrend::Falling => "falling",
             FocusTrend::Steady => "steady",
         };
-        let _ = write!(
-            line,
-            "  focus {:.4}, {:.0} % of the best, {trend}",
-            focus.score,
-            100.0 * focus.score / focus.best.max(f64::MIN_POSITIVE)
-        );
+        let _ = write!(line, "  focus {:.4}", focus.score);
+        if focus.best > 0.0 {
+            let _ = write!(line, ", {:.0} % of the best, {trend}", 100.0 * focus.score / focus.best);
+        }
     }
     let (saturated, dark) = (100.0 * values.saturated, 100.0 * values.underexposed);
     let _ = write!(

@@ -21,9 +21,15 @@ const RESUMES_WITHIN: Duration = Duration::from_secs(10);
 pub(super) fn watch(socket: &Path, printer: Printer) -> Result<Exit, CommandFailure> {
     let mut interrupts = Interrupts::of_operator().map_err(CommandFailure::Signals)?;
     let mut seat = Seat::take(socket)?;
-    let Some(mut session) = under_way(&seat.status) else {
-        let message = "no run in progress; `raysweep sessions` lists earlier runs";
-        return Err(ClientError::Rpc(RpcError::new(ErrorCode::NotRunning, message)).into());
+    // A run that is prepared has no session yet.
+    let found = if is_over(&seat.status) { Found::Nothing } else { seat.await_run(&mut interrupts)? };
+    let mut session = match found {
+        Found::GoesOn(session) => session,
+        Found::Interrupted => return Ok(Exit::Done),
+        Found::Nothing => {
+            let message = "no run in progress; `raysweep sessions` lists earlier runs";
+            return Err(ClientError::Rpc(RpcError::new(ErrorCode::NotRunning, message)).into());
+        }
     };
     let mut view = EventView::new(printer);
     loop {
@@ -63,9 +69,9 @@ fn await_daemon(socket: &Path, interrupts: &mut Interrupts) -> Result<Option<Sea
     Ok(None)
 }
 
-/// What a daemon that came back does.
+/// What a daemon does.
 enum Found {
-    /// It goes on with the run of this session.
+    /// It goes on with the run of this session, or begins it.
     GoesOn(PathBuf),
     Nothing,
     /// That was not waited for, because of Ctrl-C.
@@ -97,7 +103,7 @@ impl Seat {
         said.into_iter().flatten().try_for_each(|event| view.show(&event)).map_err(CommandFailure::Output)
     }
 
-    /// Whether a daemon that came back goes on with a run soon.
+    /// Whether the daemon goes on with a run soon, or begins one.
     fn await_run(&mut self, interrupts: &mut Interrupts) -> Result<Found, ClientError> {
         let began = Instant::now();
         while began.elapsed() < RESUMES_WITHIN {
@@ -117,8 +123,11 @@ impl Seat {
 
 /// The session of the run in progress.
 fn under_way(status: &Status) -> Option<PathBuf> {
-    let is_over = matches!(status.state, RunState::Idle | RunState::Faulted);
-    status.session.clone().filter(|_| !is_over)
+    status.session.clone().filter(|_| !is_over(status))
+}
+
+fn is_over(status: &Status) -> bool {
+    matches!(status.state, RunState::Idle | RunState::Faulted)
 }
 
 /// What became of a run whose end nobody saw.

@@ -85,7 +85,7 @@ pub(super) fn examine_plane(checkup: &mut Checkup, rig: &Rig, go_on: &(dyn Fn() 
     if let Some(capabilities) = &capabilities {
         examine_frames(checkup, rig, &frames, has_vsync && !seen.edges.is_empty());
         examine_ties(checkup, rig, capabilities, &seen, &frames);
-        examine_delay(checkup, capabilities, &seen, &frames);
+        examine_delay(checkup, rig, capabilities, &seen, &frames);
     }
 }
 
@@ -266,10 +266,16 @@ fn examine_frames(checkup: &mut Checkup, rig: &Rig, frames: &SeenFrames, has_edg
     let lost = losses(&frames.series);
     let text = lost.iter().map(|(cause, frames)| format!("{frames} lost ({cause})")).collect::<Vec<_>>();
     if !is_whole && lost.is_empty() {
-        let source = &rig.file.camera.aravis.trigger_source;
+        let file = &rig.file.camera;
+        let setting = match file.driver {
+            CameraDriver::Aravis => {
+                format!("camera.aravis.trigger_source, which is {:?}", file.aravis.trigger_source)
+            }
+            _ => "camera.v4l2.controls, which must switch the external trigger on".into(),
+        };
         let remedy = match has_edges {
             true => format!(
-                "the line has edges, so look at the wire from the projector's VSYNC to the camera's trigger input, its level, and camera.aravis.trigger_source, which is {source:?}"
+                "the line has edges, so look at the wire from the projector's VSYNC to the camera's trigger input, its level, and {setting}"
             ),
             false => "the line has no edges either: see above".into(),
         };
@@ -391,16 +397,21 @@ fn remedy_of_offset(rig: &Rig, camera: &CameraCapabilities, exposure_us: f64, of
 /// Whether the trigger's delay acts.
 fn examine_delay(
     checkup: &mut Checkup,
+    rig: &Rig,
     camera: &CameraCapabilities,
     line: &SeenLine,
     SeenFrames { series, .. }: &SeenFrames,
 ) {
+    let is_genicam = rig.file.camera.driver == CameraDriver::Aravis;
     if camera.trigger_delay_us == (0.0..=0.0) {
-        return checkup.failure(
-            DELAY,
-            "this camera cannot delay its trigger, so that delays cannot be swept",
-            "name the maker's delay in the rig file (camera.v4l2.trigger_delay), or take a camera that has one",
-        );
+        let remedy = match is_genicam {
+            true => "take a camera with the feature TriggerDelay",
+            false => {
+                "name the maker's delay in the rig file (camera.v4l2.trigger_delay), or take a camera that has one"
+            }
+        };
+        let found = "this camera cannot delay its trigger, so that delays cannot be swept";
+        return checkup.failure(DELAY, found, remedy);
     }
     let measured = |series: &FrameSeries| {
         let off_us = median(line.errors_us(series, camera.trigger_latency_us))?;
@@ -425,7 +436,14 @@ fn examine_delay(
         checkup.failure(
             DELAY,
             found,
-            "check by the maker's viewer that the trigger delay acts in the mode that the rig file sets; camera.aravis.features can set what it needs",
+            match is_genicam {
+                true => {
+                    "check by the maker's viewer that the trigger delay acts in the mode that the rig file sets; camera.aravis.features can set what it needs"
+                }
+                false => {
+                    "check by the maker's tool that the trigger delay acts in the mode that the rig file sets, and the unit of camera.v4l2.trigger_delay"
+                }
+            },
         );
     }
 }

@@ -94,8 +94,12 @@ mod with_aravis {
         }
     }
 
-    /// Whether the system allows the socket buffer that frames of this size need.
+    /// Whether the system allows the socket buffer that frames of this size need; a camera on USB needs none.
     pub fn examine_buffers(checkup: &mut Checkup, config: &AravisConfig, payload_bytes: usize) {
+        let is_on_usb = |camera: FoundCamera| camera.address.parse::<IpAddr>().is_err();
+        if config.address.is_none() && found(config).is_some_and(is_on_usb) {
+            return;
+        }
         let buffer = SocketBuffer::of(config, payload_bytes);
         match buffer.shortage() {
             Some((found, remedy)) => checkup.warning("network buffers", found, remedy),

@@ -85,9 +85,21 @@ impl Orders {
 
     /// Waits while the order is to pause.
     pub fn wait_while_paused(&self) {
+        self.wait_while_paused_until(None);
+    }
+
+    /// Waits while the order is to pause, until this moment at most.
+    pub fn wait_while_paused_until(&self, end: Option<Instant>) {
         let mut given = self.lock();
         while given.order == Order::Pause {
-            given = self.changed.wait(given).unwrap_or_else(PoisonError::into_inner);
+            let left = end.map(|end| end.saturating_duration_since(Instant::now()));
+            given = match left {
+                Some(Duration::ZERO) => return,
+                Some(left) => {
+                    self.changed.wait_timeout(given, left).unwrap_or_else(PoisonError::into_inner).0
+                }
+                None => self.changed.wait(given).unwrap_or_else(PoisonError::into_inner),
+            };
         }
     }
 }
@@ -110,6 +122,21 @@ mod tests {
         let began = Instant::now();
         orders.rest(Duration::from_millis(20));
         assert!(began.elapsed() >= Duration::from_millis(20));
+    }
+
+    #[test]
+    fn a_pause_is_waited_for_until_a_moment_at_most() {
+        let orders = Orders::default();
+        orders.give(Order::Pause);
+        orders.wait_while_paused_until(Some(Instant::now() + Duration::from_millis(20)));
+        assert_eq!(orders.now(), Order::Pause);
+        orders.wait_while_paused_until(Some(Instant::now()));
+        std::thread::scope(|scope| {
+            let waiting = scope
+                .spawn(|| orders.wait_while_paused_until(Some(Instant::now() + Duration::from_secs(3600))));
+            orders.give(Order::Go);
+            waiting.join().unwrap();
+        });
     }
 
     #[test]

@@ -34,12 +34,14 @@ pub trait Laser: Send {
 }
 
 /// A laser whose enable input is wired to the RTS line of a serial port: it goes off by itself when the process ends.
+/// The kernel raises the line when the port is opened, before anybody can lower it, so that only an interlock in the
+/// laser's own circuit keeps it dark at that moment.
 pub struct RtsLaser {
     port: Port,
 }
 
 impl RtsLaser {
-    /// Opens the port with the light off.
+    /// Opens the port and switches the light off.
     ///
     /// # Errors
     /// If the port cannot be opened or has no RTS line.

@@ -436,6 +436,20 @@ pub const TABLE: &[(&str, &[Row])] = &[
             "a_film_on_a_full_disk_is_held_between_two_cycles_and_loses_none",
         ],
         [
+            "full in the midst of batches",
+            "the mirror is parked; the run goes on by itself",
+            "no batch is lost",
+            "daemon/tests/disk.rs",
+            "batches_on_a_full_disk_are_held_and_none_is_lost",
+        ],
+        [
+            "full when a mirror's chirp is stored",
+            "the run goes on by itself",
+            "all is stored",
+            "daemon/tests/disk.rs",
+            "a_chirp_on_a_full_disk_is_held_and_none_is_lost",
+        ],
+        [
             "EIO",
             "the run is faulted at once",
             "kept",

@@ -90,6 +90,8 @@ pub struct Cut {
     pub end_ns: i64,
     /// Error message of the first of its frames that could not be denoised.
     pub problem: Option<String>,
+    /// Whether its last dots are missing because the stream has ended.
+    pub is_cut_short: bool,
 }
 
 /// Receives batches in order.
@@ -413,6 +415,7 @@ impl<S: CutSink> Gatherer<S> {
                 start_ns,
                 end_ns: start_ns,
                 problem: None,
+                is_cut_short: false,
             },
         });
         &mut building.cut
@@ -445,6 +448,10 @@ impl<S: CutSink> Gatherer<S> {
     }
 
     fn close(&mut self) {
+        let is_ending = self.ending;
+        if let Some(Building { cut, .. }) = &mut self.building {
+            cut.is_cut_short = is_ending && cut.seen.len() < self.scan.dots as usize;
+        }
         self.fill_to(self.scan.dots);
         let Some(Building { cut, .. }) = self.building.take() else { return };
         self.usual = (cut.columns.words.len(), cut.columns.values.len());

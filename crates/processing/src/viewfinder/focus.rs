@@ -28,7 +28,7 @@ pub enum Tendency {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Focus {
     /// Tenengrad: mean of the squared gradient by Sobel's operator, over the square of the mean light. Exposure and gain
-    /// do not change it.
+    /// do not change it. At least 0.
     pub score: f64,
     /// The best so far.
     pub best: f64,
@@ -61,7 +61,8 @@ impl FocusMeter {
         };
         let product = self.before.as_ref().and_then(|before| before.mean_product(&own));
         self.before = Some(own);
-        let score = product? / (mean * mean);
+        // Of a flat picture only noise is left, whose product may be negative.
+        let score = (product? / (mean * mean)).max(0.0);
         self.best = self.best.max(score);
         self.scores.push_back(score);
         if self.scores.len() > COMPARED {

@@ -25,7 +25,9 @@ pub(super) struct Guard {
 impl Guard {
     /// Why a request is refused; `None` if it is not.
     fn refusal(&self, path: &str, headers: &HeaderMap) -> Option<&'static str> {
-        let hosts = ["127.0.0.1", "localhost"].map(|name| format!("{name}:{}", self.port));
+        // Browsers leave out the port of HTTP.
+        let port = if self.port == 80 { String::new() } else { format!(":{}", self.port) };
+        let hosts = ["127.0.0.1", "localhost"].map(|name| format!("{name}{port}"));
         // A name that another server resolves to this machine (DNS rebinding) is not this address.
         let is_known = |host: &HeaderValue| hosts.iter().any(|known| known.as_bytes() == host.as_bytes());
         let mut asked = headers.get_all(header::HOST).iter();

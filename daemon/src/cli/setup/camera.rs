@@ -25,6 +25,7 @@ pub(super) enum ChosenCamera {
     Genicam {
         address: AddressOrName,
         format: PixelFormat,
+        /// What is read of the sensor, if not all.
         region: Option<[u32; 4]>,
         trigger: TriggerSetup,
         size: (usize, usize),
@@ -92,30 +93,22 @@ impl ChosenCamera {
         most_rows: Option<usize>,
     ) -> Result<Self, CommandFailure> {
         let format = ask_format(questions, facts)?;
-        let (sensor_rows, columns) = ask_size(questions, facts, format, MOST_PX)?;
-        let rows = most_rows.unwrap_or(usize::MAX).min(sensor_rows);
-        // The middle of the sensor, where a camera sees more rows than the projector draws.
-        let region = (rows < sensor_rows).then(|| {
-            let side = |pixels: usize| u32::try_from(pixels).unwrap_or(u32::MAX);
-            [0, side((sensor_rows - rows) / 2), side(columns), side(rows)]
-        });
+        let (asked_rows, columns) = ask_size(questions, facts, format, MOST_PX)?;
+        // A camera may see more rows than the projector draws.
+        let rows = most_rows.unwrap_or(usize::MAX).min(asked_rows);
+        let region = region_in(largest_size(facts, format).unwrap_or((asked_rows, columns)), (rows, columns));
         let sources: Vec<AnswerChoice> =
             facts.trigger_sources.iter().map(|source| AnswerChoice::new(source, "")).collect();
         let is_line = |source: &&String| source.starts_with("Line");
-        let first_line = facts.trigger_sources.iter().find(is_line).map_or("Line0", |source| source);
+        let first = facts.trigger_sources.iter().find(is_line).or(facts.trigger_sources.first());
+        let first = first.map_or("Line0", |source| source);
+        let question = match most_rows {
+            Some(_) => "Which input of the camera does the VSYNC reach?",
+            None => "Which input of the camera does the mirror's sample clock reach?",
+        };
         let source = match sources.is_empty() {
-            true => questions.text(
-                "trigger_source",
-                "Which input of the camera does the VSYNC reach?",
-                first_line,
-            )?,
-            false => questions.choose(
-                "trigger_source",
-                "Which input of the camera does the VSYNC reach?",
-                &sources,
-                &[],
-                Some(first_line),
-            )?,
+            true => questions.text("trigger_source", question, first)?,
+            false => questions.choose("trigger_source", question, &sources, &[], Some(first))?,
         };
         let activation = questions.choose(
             "trigger_activation",
@@ -198,12 +191,10 @@ impl ChosenCamera {
                     AddressOrName::Name(name) => text.key("name", name.as_str()),
                 };
                 let text = match region {
-                    Some(region) => {
-                        text.key_with("region", region_of(*region), "no more rows than the projector draws")
-                    }
+                    Some(region) => text.key_with("region", region_of(*region), "the middle of the sensor"),
                     None => text,
                 };
-                text.key_with("trigger_source", trigger.source.as_str(), "where the VSYNC comes in")
+                text.key_with("trigger_source", trigger.source.as_str(), "where the trigger comes in")
                     .key("trigger_activation", trigger.activation.as_str())
                     .key_with(
                         "trigger_latency_us",
@@ -254,9 +245,28 @@ impl ChosenCamera {
     }
 }
 
-/// What `raysweep calibrate` measures.
+/// What is left out.
 fn levels(text: RigText) -> RigText {
-    text.comment("white_dn and black_dn, counts of white and of darkness, are found by `raysweep calibrate`.")
+    text.comment(
+        "white_dn and black_dn, counts of white and of darkness: a plane rig's calibration measures them.",
+    )
+}
+
+/// Rows and columns of the largest frame of a format.
+fn largest_size(facts: &CameraFacts, format: PixelFormat) -> Option<(usize, usize)> {
+    let (_, sizes) = facts.formats.iter().find(|(of, _)| *of == format)?;
+    let (rows, columns) =
+        sizes.iter().max_by_key(|(rows, columns)| u64::from(*rows) * u64::from(*columns))?;
+    Some((*rows as usize, *columns as usize))
+}
+
+/// The middle of a sensor, `[x, y, width, height]`; `None` for all of it. Sensors begin at multiples of some pixels.
+fn region_in(sensor: (usize, usize), size: (usize, usize)) -> Option<[u32; 4]> {
+    const STEP: usize = 16;
+    let side = |pixels: usize| u32::try_from(pixels).unwrap_or(u32::MAX);
+    let before = |all: usize, part: usize| side(all.saturating_sub(part) / 2 / STEP * STEP);
+    let (rows, columns) = size;
+    (size != sensor).then(|| [before(sensor.1, columns), before(sensor.0, rows), side(columns), side(rows)])
 }
 
 fn region_of([x, y, width, height]: [u32; 4]) -> Table {
@@ -345,6 +355,19 @@ fn offered_by_genicam(_: &str) -> Result<CameraFacts, CommandFailure> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_smaller_frame_is_the_middle_of_the_sensor() {
+        let mono12: PixelFormat = "Mono12".parse().unwrap();
+        let formats = vec![(mono12, vec![(720, 1280), (1080, 1920)])];
+        let facts = CameraFacts { formats, ..CameraFacts::default() };
+        let sensor = largest_size(&facts, mono12).unwrap();
+        assert_eq!(sensor, (1080, 1920));
+        assert_eq!(region_in(sensor, (1080, 1920)), None);
+        assert_eq!(region_in(sensor, (720, 1920)), Some([0, 176, 1920, 720]));
+        assert_eq!(region_in(sensor, (1080, 640)), Some([640, 0, 640, 1080]));
+        assert_eq!(largest_size(&facts, "Mono8".parse().unwrap()), None);
+    }
 
     #[test]
     fn the_default_size_is_one_of_the_chosen_format_with_no_more_rows_than_the_projector_draws() {

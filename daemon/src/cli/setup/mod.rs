@@ -76,9 +76,10 @@ pub fn setup(files: &SetupFiles<'_>, printer: Printer) -> Result<Exit, CommandFa
     let value = json!({ "rig": rig, "plan": plan, "connected": connected });
     printer.print(&value, |_| {
         format!(
-            "written: {0} and {1}\nnext: `raysweep doctor --rig {0}`; then start the daemon with it, `raysweep calibrate`, and `raysweep run {1}`",
+            "written: {0} and {1}\nnext: `raysweep doctor --rig {0}`; then start the daemon with it, {2}`raysweep run {1}`",
             rig.display(),
-            plan.display()
+            plan.display(),
+            if kind == "plane" { "`raysweep calibrate`, and " } else { "and " }
         )
     })?;
     Ok(Exit::Done)
@@ -93,7 +94,7 @@ fn ask_ports(
     let ports: Vec<PathBuf> = connected.serial_ports.iter().map(|port| port.path.clone()).collect();
     let chosen = questions.ports(
         "ask_ports",
-        "Ask serial ports for mirror controllers and triggerboxes? That resets some boards, and may confuse other devices, so name only ports whose device you know to be one of these",
+        "Ask serial ports for mirror controllers and triggerboxes? That resets some boards, may confuse other devices, and may switch on for a moment what a port's control lines enable, such as a laser: name only ports whose device you know to be one of these",
         &ports,
     )?;
     for port in chosen {

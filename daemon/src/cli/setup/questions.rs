@@ -214,14 +214,13 @@ impl Questions {
         if choices.is_empty() {
             return Ok(Vec::new());
         }
-        let allowed = "all, none, or paths separated by spaces";
+        let allowed = "none, or paths separated by spaces";
         let listed: Vec<String> = choices.iter().map(|path| path.display().to_string()).collect();
         let mut prompt = format!("{question}\n  {}\n{allowed}", listed.join("\n  "));
         loop {
             let line = asked(&prompt, Some("none"))?;
             let paths: Vec<PathBuf> = match line.as_str() {
                 "none" => Vec::new(),
-                "all" => choices.to_vec(),
                 paths => paths.split_whitespace().map(PathBuf::from).collect(),
             };
             match wrong(&paths) {

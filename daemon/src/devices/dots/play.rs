@@ -17,6 +17,14 @@ use crate::run::board::StatusBoard;
 use crate::run::error::RunError;
 use crate::run::orders::{Order, Orders};
 
+/// What became of a path.
+pub struct Played {
+    /// What was lost after the last frame.
+    pub lost: Vec<Loss>,
+    /// Whether a pause ended it: the mirror is parked, and what it did not come to show is for another path.
+    pub is_held: bool,
+}
+
 /// The devices of a run and its communication with the operator.
 pub struct Player<'a> {
     pub orders: &'a Orders,
@@ -44,8 +52,8 @@ impl Player<'_> {
     }
 
     /// Plays a path `rounds` times while the camera takes its frames. Ends with the path or, without a mirror, after
-    /// `frames` frames; earlier if `enough` is set or the run is told to end. Returns what was lost after the last
-    /// frame.
+    /// `frames` frames; earlier if `enough` is set or the run is told to end or to pause. A recording rather waits for the
+    /// end of a pause.
     ///
     /// # Errors
     /// An error of the mirror or the camera.
@@ -56,7 +64,7 @@ impl Player<'_> {
         frames: u64,
         enough: &AtomicBool,
         deliver: &mut (dyn FnMut(Arrival) -> Result<(), FrameRefused> + Send),
-    ) -> Result<Vec<Loss>, RunError> {
+    ) -> Result<Played, RunError> {
         let orders = self.orders;
         let is_driven = self.motion.is_driven();
         // Without a mirror, no path goes on after the frames, and the next frame of a recording is the next pass's.
@@ -65,7 +73,11 @@ impl Player<'_> {
         let mut source = Source { camera: &mut *self.camera, pool: &self.pool, pace: self.pace };
         let (pace, is_simulated) = (self.pace, matches!(self.stand, Stand::Simulated(_)));
         let taken = AtomicU64::new(0);
+        let is_held = AtomicBool::new(false);
         let wanted = || {
+            if !is_driven {
+                orders.wait_while_paused();
+            }
             let is_over = match is_driven {
                 true => path_over.load(Ordering::Relaxed),
                 false => enough.load(Ordering::Relaxed) || taken.load(Ordering::Relaxed) >= frames,
@@ -104,7 +116,11 @@ impl Player<'_> {
                 }
                 let _over = SetOnDrop(&path_over);
                 let go_on = || {
-                    orders.go_on() && !enough.load(Ordering::Relaxed) && !camera_over.load(Ordering::Relaxed)
+                    let order = orders.now();
+                    is_held.store(order == Order::Pause, Ordering::Relaxed);
+                    order == Order::Go
+                        && !enough.load(Ordering::Relaxed)
+                        && !camera_over.load(Ordering::Relaxed)
                 };
                 let fed = motion.play(&clock, &go_on);
                 if fed.is_err() {
@@ -137,7 +153,7 @@ impl Player<'_> {
             _ => {}
         }
         fed.map_err(panicked)??;
-        Ok(taken.map_err(panicked)??)
+        Ok(Played { lost: taken.map_err(panicked)??, is_held: is_held.into_inner() })
     }
 }
 

@@ -20,7 +20,7 @@ use super::sink::{BatchSink, RawSink, StoredBatches, Writing};
 use crate::devices::dots::camera::FrameRefused;
 use crate::devices::dots::frames_waiting;
 use crate::devices::dots::motion::Motion;
-use crate::devices::dots::play::Player;
+use crate::devices::dots::play::{Played, Player};
 use crate::probes::Probes;
 use crate::rig::{DotDevices, DotRig, Pace};
 use crate::run::error::RunError;
@@ -99,17 +99,28 @@ pub fn acquire(rig: &DotRig, task: &Arc<DotTask>, mut run: Run) -> Result<Acquir
     };
     let passed = passes.all();
     let last_frame = passes.last_frame;
-    let _ = run.board.go(RunState::Draining);
     // Turn the light off before anything else ends.
     drop(motion);
+    let stored = storage.finish();
+    let _ = run.board.go(RunState::Draining);
     if let Err(error) = camera.disarm() {
         tracing::warn!(%error, "camera not disarmed");
     }
-    let StoredBatches { ledger, problems, error } = storage.finish()?;
+    let StoredBatches { ledger, problems, error } = stored?;
     let final_s = last_frame.map(|last| last.elapsed().as_secs_f64());
     let fault = error.map(RunError::from).or(passed.err());
     let problems = [run.warnings, problems].concat();
     Ok(Acquired { session: run.session, ledger, problems, fault, final_s })
+}
+
+/// A pass that is over.
+struct Passed {
+    sensor: Sensor,
+    raw: Option<RawSink>,
+    /// Number of batches that it took.
+    batches: u32,
+    /// Whether a pause ended it, so that others may be left.
+    is_held: bool,
 }
 
 struct DotPasses<'a> {
@@ -136,7 +147,7 @@ impl DotPasses<'_> {
             true => {
                 let (rows, columns) = (self.task.shape.height(), self.task.shape.width());
                 let frames = RawFrames::create(&self.session.raw_path(), rows, columns)?;
-                Some(RawSink::new(frames, self.task.format, self.task.shape.values()))
+                Some(self.storage.raw_sink(frames, self.task.format, self.task.shape.values()))
             }
             false => None,
         };
@@ -144,10 +155,16 @@ impl DotPasses<'_> {
         let planes = plan.calibration.iter().enumerate().map(|(index, plane)| (Some(index), plane.batches));
         for (plane, batches) in planes.chain([(None, plan.count)]) {
             self.player.place(plane.map_or(Subject::Scene, Subject::Plane), plan.calibration.len())?;
+            let mut cut = 0;
+            while cut < batches && self.orders.go_on() {
+                let passed = self.pass(sensor, raw, first_batch + cut as usize, plane, batches - cut)?;
+                (sensor, raw) = (passed.sensor, passed.raw);
+                cut = if passed.is_held { cut + passed.batches } else { batches };
+                self.orders.wait_while_paused();
+            }
             if !self.orders.go_on() {
                 break;
             }
-            (sensor, raw) = self.pass(sensor, raw, first_batch, plane, batches)?;
             first_batch += batches as usize;
         }
         match raw {
@@ -197,29 +214,33 @@ impl DotPasses<'_> {
         let (mut counts, mut failed, mut frames) = (vec![0; task.shape.values()], None, 0);
         let has_enough = AtomicBool::new(false);
         let rounds = task.batches.dark_rounds(wanted);
-        for _ in 0..MOST_DARK_PASSES {
+        let mut passes = 0;
+        while passes < MOST_DARK_PASSES {
             let mut arrived = 0;
-            let lost = self.player.play(&path, rounds, wanted.into(), &has_enough, &mut |arrival| {
-                arrived += 1;
-                // Some more frames arrive while waiting for the camera's last one.
-                if !has_enough.load(Ordering::Relaxed) {
-                    let unpacked = task.format.unpack_into(&arrival.frame.data, &mut counts);
-                    let pushed = match unpacked {
-                        Ok(()) => push(&counts).map_err(RunError::from),
-                        Err(error) => Err(RunError::Frame(error.to_string())),
-                    };
-                    match pushed {
-                        Ok(wants_more) => has_enough.store(!wants_more, Ordering::Relaxed),
-                        Err(error) => {
-                            failed = Some(error);
-                            return Err(FrameRefused::Closed);
+            let Played { lost, is_held } =
+                self.player.play(&path, rounds, wanted.into(), &has_enough, &mut |arrival| {
+                    arrived += 1;
+                    // Some more frames arrive while waiting for the camera's last one.
+                    if !has_enough.load(Ordering::Relaxed) {
+                        let unpacked = task.format.unpack_into(&arrival.frame.data, &mut counts);
+                        let pushed = match unpacked {
+                            Ok(()) => push(&counts).map_err(RunError::from),
+                            Err(error) => Err(RunError::Frame(error.to_string())),
+                        };
+                        match pushed {
+                            Ok(wants_more) => has_enough.store(!wants_more, Ordering::Relaxed),
+                            Err(error) => {
+                                failed = Some(error);
+                                return Err(FrameRefused::Closed);
+                            }
                         }
                     }
-                }
-                frames += 1 + arrival.lost_before.iter().map(|loss| loss.frames).sum::<u64>();
-                Ok(())
-            })?;
+                    frames += 1 + arrival.lost_before.iter().map(|loss| loss.frames).sum::<u64>();
+                    Ok(())
+                })?;
             frames += lost.iter().map(|loss| loss.frames).sum::<u64>();
+            self.orders.wait_while_paused();
+            passes += u32::from(!is_held);
             // More frames would not help if as many as are wanted were of no use.
             let is_over = failed.is_some() || has_enough.load(Ordering::Relaxed) || arrived >= wanted;
             // A recording has no more frames.
@@ -235,7 +256,7 @@ impl DotPasses<'_> {
         }
     }
 
-    /// Takes the batches of one plane or of the scene.
+    /// Takes the batches of one plane or of the scene, until a pause.
     fn pass(
         &mut self,
         sensor: Sensor,
@@ -243,7 +264,7 @@ impl DotPasses<'_> {
         first_batch: usize,
         plane: Option<usize>,
         batches: u32,
-    ) -> Result<(Sensor, Option<RawSink>), RunError> {
+    ) -> Result<Passed, RunError> {
         let (task, plan) = (self.task, &self.task.batches);
         let Sensor { correction, background, floor } = sensor;
         let stage = self.probes.around(task.stage(&correction)?);
@@ -283,7 +304,7 @@ impl DotPasses<'_> {
         drop(input);
         let gathered = flow.join();
         // An error of the mirror says more than what follows from it in the workers.
-        let lost = played?;
+        let Played { lost, is_held } = played?;
         let Gathered { sink, background, error } = gathered?;
         let mut rest = Counts::default();
         for Loss { frames, cause } in lost {
@@ -291,9 +312,11 @@ impl DotPasses<'_> {
             rest.lose(cause, frames);
         }
         self.storage.outside(rest);
-        if let Some(error) = error.filter(|_| self.orders.go_on()) {
+        // Of few frames, the trailing dot may not be found.
+        if let Some(error) = error.filter(|_| self.orders.go_on() && !is_held) {
             return Err(error.into());
         }
-        Ok((Sensor { correction, background, floor }, sink.into_raw()))
+        let (batches, raw) = sink.finish(is_held);
+        Ok(Passed { sensor: Sensor { correction, background, floor }, raw, batches, is_held })
     }
 }

@@ -17,6 +17,7 @@ use serde_json::{Map, Value, json};
 use crate::live::{FLOODLIT, Outlet};
 use crate::run::board::StatusBoard;
 use crate::run::orders::{Order, Orders};
+use crate::run::patience::write_patiently;
 use crate::run::progress::ProgressMeter;
 
 /// Capacity of the queue of batches for the disk.
@@ -55,6 +56,7 @@ impl Outbox {
 /// Handle of the writer's thread.
 pub struct BatchSink {
     outbox: Outbox,
+    board: Arc<StatusBoard>,
     thread: JoinHandle<BatchWriter>,
 }
 
@@ -102,17 +104,24 @@ impl BatchSink {
         let planned = writing.task.batches.total();
         let progress = ProgressMeter::new(&writing.orders, 0, planned);
         let outbox = Outbox { items, orders: writing.orders.clone() };
+        let board = writing.board.clone();
         let writer = BatchWriter { writing, progress, first_ns: None, problems: Vec::new(), error: None };
         let thread = thread::Builder::new()
             .name("dots-writer".into())
             .spawn(move || writer.run(&inbox))
             .map_err(|source| PipelineError::Spawn { name: "dots-writer", source: source.into() })?;
-        Ok(Self { outbox, thread })
+        Ok(Self { outbox, board, thread })
     }
 
     /// The sink of a pass whose first batch has this index; raw frames go to `raw`, if given.
     pub fn sink(&self, first_batch: usize, plane: Option<usize>, raw: Option<RawSink>) -> PassSink {
-        PassSink { outbox: self.outbox.clone(), first_batch, plane, raw }
+        PassSink { outbox: self.outbox.clone(), first_batch, plane, raw, batches: 0, cut_short: None }
+    }
+
+    /// Where raw frames of this format and number of pixels are kept.
+    pub fn raw_sink(&self, frames: RawFrames, format: PixelFormat, pixels: usize) -> RawSink {
+        let (orders, board) = (self.outbox.orders.clone(), self.board.clone());
+        RawSink { orders, board, frames, format, counts: vec![0; pixels], before: 0, error: None }
     }
 
     /// Records frames that belong to no batch.
@@ -148,10 +157,16 @@ pub struct PassSink {
     first_batch: usize,
     plane: Option<usize>,
     raw: Option<RawSink>,
+    /// Number of batches handed on.
+    batches: u32,
+    /// A batch whose last dots are missing, until it is known why.
+    cut_short: Option<Cut>,
 }
 
 /// Stores raw frames.
 pub struct RawSink {
+    orders: Arc<Orders>,
+    board: Arc<StatusBoard>,
     frames: RawFrames,
     format: PixelFormat,
     counts: Vec<u16>,
@@ -161,19 +176,17 @@ pub struct RawSink {
 }
 
 impl RawSink {
-    /// Stores frames of this format and number of pixels.
-    pub fn new(frames: RawFrames, format: PixelFormat, pixels: usize) -> Self {
-        Self { frames, format, counts: vec![0; pixels], before: 0, error: None }
-    }
-
     /// Completes the file.
     ///
     /// # Errors
     /// When a write fails, now or earlier.
-    pub fn finish(self) -> raysweep_session::Result<()> {
+    pub fn finish(mut self) -> raysweep_session::Result<()> {
         match self.error {
             Some(error) => Err(error),
-            None => self.frames.finish(),
+            None => {
+                write_patiently(&self.orders, &self.board, || self.frames.flush())?;
+                self.frames.finish()
+            }
         }
     }
 
@@ -182,7 +195,8 @@ impl RawSink {
         if self.format.unpack_into(&frame.data, &mut self.counts).is_err() {
             self.counts.fill(0);
         }
-        let kept = self.frames.push(&self.counts);
+        let Self { orders, board, frames, counts, .. } = self;
+        let kept = write_patiently(orders, board, || frames.push(counts));
         self.note(kept);
     }
 
@@ -195,19 +209,40 @@ impl RawSink {
 }
 
 impl PassSink {
-    /// Returns the raw sink.
-    pub fn into_raw(self) -> Option<RawSink> {
-        self.raw.map(|mut raw| {
+    /// Ends the pass; returns the number of its batches and the raw sink. A batch that a pause cut short is none: it is
+    /// taken again.
+    pub fn finish(mut self, is_held: bool) -> (u32, Option<RawSink>) {
+        match self.cut_short.take() {
+            Some(Cut { mut counts, .. }) if is_held => {
+                counts.cancelled += std::mem::take(&mut counts.averaged);
+                self.outbox.send(Item::Outside(counts));
+            }
+            Some(cut) => self.hand_on(cut),
+            None => {}
+        }
+        let raw = self.raw.map(|mut raw| {
             raw.before = raw.frames.len();
             raw
-        })
+        });
+        (self.batches, raw)
+    }
+
+    fn hand_on(&mut self, cut: Cut) {
+        self.batches = cut.batch + 1;
+        let batch = self.first_batch + cut.batch as usize;
+        self.outbox.send(Item::Batch(Box::new(cut), batch, self.plane));
     }
 }
 
 impl CutSink for PassSink {
     fn take(&mut self, cut: Cut) {
-        let batch = self.first_batch + cut.batch as usize;
-        self.outbox.send(Item::Batch(Box::new(cut), batch, self.plane));
+        if let Some(before) = self.cut_short.take() {
+            self.hand_on(before);
+        }
+        match cut.is_cut_short {
+            true => self.cut_short = Some(cut),
+            false => self.hand_on(cut),
+        }
     }
 
     fn outside(&mut self, counts: Counts) {
@@ -224,7 +259,8 @@ impl CutSink for PassSink {
         let first_batch = self.first_batch;
         if let Some(raw) = self.raw.as_mut().filter(|raw| raw.error.is_none()) {
             let place = place.map(|(batch, index)| (first_batch + batch as usize, index as usize));
-            let noted = raw.frames.note(raw.before + arrival, id, place);
+            let RawSink { orders, board, frames, before, .. } = &mut *raw;
+            let noted = write_patiently(orders, board, || frames.note(*before + arrival, id, place));
             raw.note(noted);
         }
     }
@@ -279,8 +315,10 @@ impl BatchWriter {
         };
         let attributes = json!({ "batch": batch, "plane": plane, "start_s": start_s });
         let attributes = attributes.as_object().cloned().unwrap_or_default();
-        let written = self.writing.dots.write(batch, &stored, attributes);
-        match written.and_then(|()| self.writing.ledger.append(&Entry::Batch(entry.clone()))) {
+        let Writing { dots, ledger, board, orders, .. } = &mut self.writing;
+        let written = write_patiently(orders, board, || dots.write(batch, &stored, attributes.clone()));
+        let record = Entry::Batch(entry.clone());
+        match written.and_then(|()| write_patiently(orders, board, || ledger.append(&record))) {
             Ok(()) => self.progress.point_stored(&counts),
             Err(error) => {
                 tracing::error!(%error, batch, "batch not stored");
@@ -332,7 +370,8 @@ impl BatchWriter {
     }
 
     fn append(&mut self, entry: &Entry) {
-        if let Err(error) = self.writing.ledger.append(entry) {
+        let Writing { ledger, board, orders, .. } = &mut self.writing;
+        if let Err(error) = write_patiently(orders, board, || ledger.append(entry)) {
             tracing::error!(%error, "ledger not written");
             self.fail(error);
         }
@@ -348,7 +387,8 @@ mod tests {
         let (items, inbox) = sync_channel(WAITING_BATCHES);
         let orders = Arc::new(Orders::default());
         let outbox = Outbox { items, orders: orders.clone() };
-        let mut sink = PassSink { outbox, first_batch: 0, plane: None, raw: None };
+        let mut sink =
+            PassSink { outbox, first_batch: 0, plane: None, raw: None, batches: 0, cut_short: None };
         sink.outside(Counts::default());
         assert_eq!(orders.now(), Order::Go);
         drop(inbox);

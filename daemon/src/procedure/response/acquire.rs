@@ -14,10 +14,11 @@ use raysweep_session::ledger::{AxisEntry, Entry, Ledger};
 use crate::devices::dots::FRAMES_AT_WORK;
 use crate::devices::dots::camera::FrameRefused;
 use crate::devices::dots::motion::Motion;
-use crate::devices::dots::play::Player;
+use crate::devices::dots::play::{Played, Player};
 use crate::rig::{DotDevices, DotRig};
 use crate::run::error::RunError;
 use crate::run::life::Run;
+use crate::run::patience::write_patiently;
 use crate::run::progress::ProgressMeter;
 
 /// Pixels this many standard deviations beyond the others are hot.
@@ -97,12 +98,13 @@ impl Recorder {
         let sensor = self.sensor(player, &mut progress)?;
         let Some(sensor) = sensor.filter(|_| self.run.orders.go_on()) else { return Ok(()) };
         let finder = DotFinder::new(self.task.shape, self.task.region.clone(), &sensor);
-        for axis in 0..AXES.len() {
+        let mut axis = 0;
+        while axis < AXES.len() {
             self.run.orders.wait_while_paused();
             if !self.run.orders.go_on() {
                 break;
             }
-            self.axis(axis, player, &finder, &mut progress)?;
+            axis += usize::from(self.axis(axis, player, &finder, &mut progress)?);
         }
         Ok(())
     }
@@ -119,71 +121,88 @@ impl Recorder {
         let path = task.paths[0].clone().with_light(|_| 0);
         let rounds = wanted.div_ceil(task.frames() as u32) + 1;
         let has_enough = AtomicBool::new(false);
-        let mut arrivals = Arrivals::new(&task);
-        let after = player.play(&path, rounds, wanted.into(), &has_enough, &mut |arrival| {
-            arrivals.take(&arrival, |_, counts| {
-                if !has_enough.load(Ordering::Relaxed) {
-                    has_enough.store(!dark.push(counts)?, Ordering::Relaxed);
-                }
-                Ok(())
-            })
-        })?;
-        let counts = arrivals.account(&after, 0)?;
-        // No record needs these frames.
-        let settling = Counts { settling: counts.cancelled, cancelled: 0, ..counts };
-        self.append(&Entry::Outside { counts: settling.clone() }, settling, progress)?;
+        loop {
+            let mut arrivals = Arrivals::new(&task);
+            let Played { lost, is_held } =
+                player.play(&path, rounds, wanted.into(), &has_enough, &mut |arrival| {
+                    arrivals.take(&arrival, |_, counts| {
+                        if !has_enough.load(Ordering::Relaxed) {
+                            has_enough.store(!dark.push(counts)?, Ordering::Relaxed);
+                        }
+                        Ok(())
+                    })
+                })?;
+            let counts = arrivals.account(&lost, 0)?;
+            // No record needs these frames.
+            let settling = Counts { settling: counts.cancelled, cancelled: 0, ..counts };
+            self.append(&Entry::Outside { counts: settling.clone() }, settling, progress)?;
+            orders.wait_while_paused();
+            if !is_held || has_enough.load(Ordering::Relaxed) || !orders.go_on() {
+                break;
+            }
+        }
         match orders.go_on() {
             true => Ok(Some(dark.finish(HOT_SIGMAS, None, sampling(task.format))?)),
             false => Ok(None),
         }
     }
 
-    /// Records the chirp of one axis.
+    /// Records the chirp of one axis; returns whether it is recorded, and not cut short by an order.
     fn axis(
         &mut self,
         axis: usize,
         player: &mut Player<'_>,
         finder: &DotFinder,
         progress: &mut ProgressMeter,
-    ) -> Result<(), RunError> {
+    ) -> Result<bool, RunError> {
         let task = self.task.clone();
         let mut record = Record::new(task.commanded_deg(axis));
         let frames = record.commanded_deg.len();
         let (mut came, mut shown) = (0, 0);
         let mut arrivals = Arrivals::new(&task);
         let never = AtomicBool::new(false);
-        let after = player.play(&task.paths[axis], 1, frames as u64, &never, &mut |arrival| {
-            arrivals.take(&arrival, |frame, counts| {
-                if frame < frames {
-                    came += 1;
-                    if let Some(place) = finder.find(counts) {
-                        record.note(frame, place);
-                        shown += 1;
+        let Played { lost, is_held } =
+            player.play(&task.paths[axis], 1, frames as u64, &never, &mut |arrival| {
+                arrivals.take(&arrival, |frame, counts| {
+                    if frame < frames {
+                        came += 1;
+                        if let Some(place) = finder.find(counts) {
+                            record.note(frame, place);
+                            shown += 1;
+                        }
+                        if came % (frames / TOLD_OF_AXIS).max(1) == 0 {
+                            let (frames, of) = (came as u32, frames as u32);
+                            progress.under_way = Some(PointUnderWay { frames, of });
+                            self.run.board.publish(Event::Progress(progress.shown()));
+                        }
                     }
-                    if came % (frames / TOLD_OF_AXIS).max(1) == 0 {
-                        let (frames, of) = (came as u32, frames as u32);
-                        progress.under_way = Some(PointUnderWay { frames, of });
-                        self.run.board.publish(Event::Progress(progress.shown()));
-                    }
-                }
-                Ok(())
-            })
-        })?;
-        let counts = arrivals.account(&after, shown)?;
-        if !self.run.orders.go_on() {
+                    Ok(())
+                })
+            })?;
+        let counts = arrivals.account(&lost, shown)?;
+        if is_held || !self.run.orders.go_on() {
             // A record that was cut short does not count.
             progress.under_way = None;
             let counts = Counts { cancelled: counts.cancelled + counts.averaged, averaged: 0, ..counts };
-            return self.append(&Entry::Outside { counts: counts.clone() }, counts, progress);
+            self.append(&Entry::Outside { counts: counts.clone() }, counts, progress)?;
+            return Ok(false);
         }
-        record.write(&self.run.session, axis, &task)?;
+        let Run { session, orders, board, .. } = &self.run;
+        write_patiently(orders, board, || record.write(session, axis, &task))?;
         let of_axis = format!("products/chirp_{}.", AXES[axis]);
-        self.run.ledger.append(&self.run.session.bind(|file| file.starts_with(&of_axis))?)?;
+        let bound = self.run.session.bind(|file| file.starts_with(&of_axis))?;
+        self.record(&bound)?;
         progress.stored += 1;
         progress.under_way = None;
         let empty = came - shown as usize;
         let entry = AxisEntry { axis, frames, lost: frames - came, empty, counts: counts.clone() };
-        self.append(&Entry::Axis(entry), counts, progress)
+        self.append(&Entry::Axis(entry), counts, progress)?;
+        Ok(true)
+    }
+
+    fn record(&mut self, entry: &Entry) -> Result<(), RunError> {
+        let Run { ledger, orders, board, .. } = &mut self.run;
+        Ok(write_patiently(orders, board, || ledger.append(entry))?)
     }
 
     fn append(
@@ -192,7 +211,7 @@ impl Recorder {
         counts: Counts,
         progress: &mut ProgressMeter,
     ) -> Result<(), RunError> {
-        self.run.ledger.append(entry)?;
+        self.record(entry)?;
         progress.counts.add(&counts);
         self.run.board.publish(Event::Progress(progress.shown()));
         Ok(())

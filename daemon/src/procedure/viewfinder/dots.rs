@@ -95,15 +95,21 @@ fn watch(
 ) -> Result<(), RunError> {
     let (orders, pace) = (player.orders, player.pace);
     let mut writes = 0;
-    while orders.go_on() && !finder.is_over() {
-        orders.wait_while_paused();
+    loop {
+        orders.wait_while_paused_until(finder.ends());
+        if !orders.go_on() || finder.is_over() {
+            return Ok(());
+        }
         let wanted = orders.look.take();
         finder.change(&wanted);
         if let Some(exposure_us) = wanted.exposure_us {
             let wanted = CameraSettings { exposure_us, ..*settings };
             writes += 1;
             match player.camera.configure(SettingsId { point: 0, attempt: writes }, &wanted) {
-                Ok(_) => *settings = wanted,
+                Ok(_) => {
+                    *settings = wanted;
+                    finder.expose(exposure_us);
+                }
                 Err(error) if error.kind == DeviceErrorKind::OutOfRange => finder.complain(error.to_string()),
                 Err(error) => return Err(error.into()),
             }
@@ -131,5 +137,4 @@ fn watch(
             return Err(error);
         }
     }
-    Ok(())
 }

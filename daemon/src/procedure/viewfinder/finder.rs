@@ -101,6 +101,11 @@ impl Finder {
         }
     }
 
+    /// When its time is over, if ever.
+    pub fn ends(&self) -> Option<Instant> {
+        self.ends
+    }
+
     /// Whether its time is over.
     pub fn is_over(&self) -> bool {
         self.ends.is_some_and(|ends| Instant::now() >= ends)
@@ -121,12 +126,16 @@ impl Finder {
         self.values.exposure_us
     }
 
-    /// Takes over what clients have changed.
+    /// Notes the exposure of the frames from now on.
+    pub fn expose(&mut self, exposure_us: f64) {
+        self.values.exposure_us = exposure_us;
+    }
+
+    /// Takes over what clients have changed, but for the exposure, which the camera may refuse.
     pub fn change(&mut self, wanted: &ViewfinderParams) {
         let values = &mut self.values;
         values.picture = wanted.picture.unwrap_or(values.picture);
         values.region = wanted.region.unwrap_or(values.region);
-        values.exposure_us = wanted.exposure_us.unwrap_or(values.exposure_us);
         values.problem = None;
         if values.picture != FinderPicture::Align {
             values.alignment = None;
@@ -144,7 +153,7 @@ impl Finder {
     }
 
     /// Takes back a complaint, with the next picture.
-    pub fn is_mended(&mut self, problem: &str) {
+    pub fn take_back(&mut self, problem: &str) {
         self.values.problem.take_if(|told| told == problem);
     }
 

@@ -16,7 +16,7 @@ use crate::plane::LitProjector;
 use crate::rig::{Devices, Pace, Rig};
 use crate::run::error::RunError;
 use crate::run::life::Run;
-use crate::run::orders::Orders;
+use crate::run::orders::{Order, Orders};
 
 /// Timeout of one wait for a frame, after which orders are looked at.
 const POLL: Duration = Duration::from_millis(50);
@@ -102,7 +102,7 @@ struct Viewer<'a> {
 
 impl Viewer<'_> {
     fn run(&mut self) -> Result<(), RunError> {
-        self.expose()?;
+        self.expose(self.finder.exposure_us())?;
         self.camera.arm()?;
         self.light()?;
         let viewed = self.frames();
@@ -119,12 +119,16 @@ impl Viewer<'_> {
         };
         let mut waiting = Instant::now();
         while self.orders.go_on() && !self.finder.is_over() {
-            self.orders.wait_while_paused();
+            if self.orders.now() == Order::Pause {
+                self.orders.wait_while_paused_until(self.finder.ends());
+                waiting = Instant::now();
+                continue;
+            }
             self.change()?;
             match self.camera.next_frame(&mut self.buffer, POLL)? {
                 Some(stamp) => {
                     waiting = Instant::now();
-                    self.finder.is_mended(complaint);
+                    self.finder.take_back(complaint);
                     self.frame(&stamp)?;
                 }
                 None if waiting.elapsed() > PATIENCE + 2 * frame => self.finder.complain(complaint),
@@ -142,8 +146,8 @@ impl Viewer<'_> {
         let wanted = self.orders.look.take();
         self.finder.change(&wanted);
         let ViewfinderParams { picture, exposure_us, .. } = wanted;
-        if exposure_us.is_some() {
-            self.expose()?;
+        if let Some(exposure_us) = exposure_us {
+            self.expose(exposure_us)?;
         }
         if picture.is_some() {
             self.rows.restart();
@@ -152,13 +156,16 @@ impl Viewer<'_> {
         Ok(())
     }
 
-    /// Writes the exposure.
-    fn expose(&mut self) -> Result<(), RunError> {
-        let settings = self.task.settings(self.finder.exposure_us(), &self.capabilities);
+    /// Writes the exposure. One that the camera refuses leaves it as it was.
+    fn expose(&mut self, exposure_us: f64) -> Result<(), RunError> {
+        let settings = self.task.settings(exposure_us, &self.capabilities);
         let applied = self.camera.configure(SettingsId { point: 0, attempt: self.writes }, &settings);
         self.writes += 1;
         match applied {
-            Ok(applied) => self.first_seq = applied.first_frame.certain(),
+            Ok(applied) => {
+                self.finder.expose(exposure_us);
+                self.first_seq = applied.first_frame.certain();
+            }
             Err(error) if error.kind == DeviceErrorKind::OutOfRange => {
                 self.finder.complain(error.to_string())
             }

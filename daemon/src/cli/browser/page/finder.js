@@ -50,8 +50,8 @@ export function showFinder(values) {
   const { focus, alignment, dot } = values;
   const rows = [];
   if (focus) {
-    const share = percent(focus.score / focus.best);
-    rows.push(["focus", `${focus.score.toPrecision(4)}, ${share} of the best, ${focus.trend}`]);
+    const share = focus.best > 0 ? `, ${percent(focus.score / focus.best)} of the best, ${focus.trend}` : "";
+    rows.push(["focus", `${focus.score.toPrecision(4)}${share}`]);
   }
   rows.push(["saturated", percent(values.saturated)], ["nearly dark", percent(values.underexposed)],
     ["mean", `${number(values.mean_dn)} of ${values.full_dn} counts`], ["brightest", `${values.brightest_dn} counts`]);

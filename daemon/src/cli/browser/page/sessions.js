@@ -139,6 +139,13 @@ function figures(session) {
     .flatMap(([key, value]) => [element("dt", {}, key), element("dd", {}, value)]));
 }
 
+function joined(one, two) {
+  const both = new Float32Array(one.length + two.length);
+  both.set(one);
+  both.set(two, one.length);
+  return both;
+}
+
 async function pictures(sides, [first, second], menu, onpixel) {
   const name = menu.value;
   const of = (session) => fetchPicture(address(session, `/picture/${encodeURIComponent(name)}`));
@@ -147,7 +154,7 @@ async function pictures(sides, [first, second], menu, onpixel) {
   if (name !== menu.value) return;
   sides.replaceChildren();
   // In two pictures side by side, the same light has the same brightness.
-  const range = two && Float32Array.from([...one.values, ...two.values]);
+  const range = two && joined(one.values, two.values);
   const side = (title, picture, options = { range }) => {
     const box = element("div", {}, element("h3", {}, title));
     sides.append(box);
