@@ -156,5 +156,6 @@ fn clients_cost_a_run_no_frame() {
         );
         swept
     });
+    println!("{CLIENTS} clients over none, 99 %: {:.2}", swept[1].p99_ms / swept[0].p99_ms);
     assert_eq!(swept[1].lost, 0);
 }

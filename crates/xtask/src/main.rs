@@ -61,11 +61,11 @@ fn main() -> ExitCode {
             Err(format!("`{unknown}` is not an option of {command}; it has none"))
         }
         ["fresh", releases @ ..] => fresh::fresh(releases),
-        ["guest", "--systemd"] => guest::systemd::systemd(),
+        ["guest", "--systemd"] => guest::systemd(),
         ["guest", option, ..] if option.starts_with('-') => {
             Err(format!("`{option}` is not an option of guest; there is --systemd, alone"))
         }
-        ["guest", names @ ..] => guest::guest(names),
+        ["guest", names @ ..] => guest::drivers(names),
         ["soak"] => soak::soak(20.0),
         ["soak", "--minutes"] => {
             Err("`--minutes` needs a number of minutes, such as --minutes 60".to_owned())

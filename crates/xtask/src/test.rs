@@ -5,9 +5,11 @@ use std::process::Command;
 use crate::run::{Done, cargo, run, target};
 use crate::{binaries, guest, packages, python, rootfs, space};
 
-/// The most that all of this command has on the disk of the target folder. Where temporary files are on it too, they are
+/// The most that all of this command has on the disk of the target folder, without incremental files. Where temporary files are on it too, they are
 /// gone before the guests' disks are made.
 const TARGET_GIB: u64 = 11;
+/// What cargo's incremental files add, unless CARGO_INCREMENTAL forbids them.
+const INCREMENTAL_GIB: u64 = 3;
 /// What tests that run at once have in the folder for temporary files; and what is built anew after a small change.
 const TEMPORARY_GIB: u64 = 2;
 
@@ -38,12 +40,7 @@ pub fn test(wanted: Guest) -> Done {
     run(cargo().args(["test", "--workspace", "--all-features", "--doc", "--quiet"]))?;
     tested?;
     match wanted {
-        Guest::Run => {
-            let drivers = guest::guest(&[]).map_err(|error| format!("kernel guest: {error}"));
-            let systemd = guest::systemd::systemd().map_err(|error| format!("systemd guest: {error}"));
-            let errors: Vec<String> = [drivers, systemd].into_iter().filter_map(Result::err).collect();
-            if errors.is_empty() { Ok(()) } else { Err(errors.join("\n")) }
-        }
+        Guest::Run => guest::both(),
         Guest::Skip => {
             println!("{}", guest::skipped());
             Ok(())
@@ -63,18 +60,6 @@ fn has_networks() -> Done {
     Err(format!("the tests need networks of their own, and `unshare --net` fails here ({error}); {remedy}"))
 }
 
-/// Fails where the build or the tests would fill the disk.
-fn has_space() -> Done {
-    let target = target();
-    // What other commands have left there saves nothing.
-    let taken_bytes: u64 = ["debug", "guest"].iter().map(|name| space::taken_bytes(&target.join(name))).sum();
-    let missing_gib = TARGET_GIB.saturating_sub(taken_bytes / space::GIB).max(TEMPORARY_GIB);
-    let remedy = "make room, or name a folder on another disk by CARGO_TARGET_DIR";
-    space::require(&target, missing_gib, "what is made there may take another", remedy)?;
-    let remedy = "make room, or name a folder on another disk by TMPDIR";
-    space::require(&std::env::temp_dir(), TEMPORARY_GIB, "the tests write up to", remedy)
-}
-
 fn unshare_network() -> Done {
     let tried = Command::new("unshare").args(["--net", "true"]).output();
     let output = tried.map_err(|error| error.to_string())?;
@@ -82,6 +67,20 @@ fn unshare_network() -> Done {
         true => Ok(()),
         false => Err(String::from_utf8_lossy(&output.stderr).trim().to_owned()),
     }
+}
+
+/// Fails where the build or the tests would fill the disk.
+fn has_space() -> Done {
+    let target = target();
+    // What other commands have left there saves nothing.
+    let taken_bytes: u64 = ["debug", "guest"].iter().map(|name| space::taken_bytes(&target.join(name))).sum();
+    let is_incremental = std::env::var_os("CARGO_INCREMENTAL").is_none_or(|value| value != "0");
+    let needed_gib = TARGET_GIB + if is_incremental { INCREMENTAL_GIB } else { 0 };
+    let missing_gib = needed_gib.saturating_sub(taken_bytes / space::GIB).max(TEMPORARY_GIB);
+    let remedy = "make room, or name a folder on another disk by CARGO_TARGET_DIR";
+    space::require(&target, missing_gib, "what is made there may take another", remedy)?;
+    let remedy = "make room, or name a folder on another disk by TMPDIR";
+    space::require(&std::env::temp_dir(), TEMPORARY_GIB, "the tests write up to", remedy)
 }
 
 /// Fails without rustfmt or clippy, which `rustup` can leave out, before anything is installed or built.

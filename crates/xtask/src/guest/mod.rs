@@ -12,7 +12,7 @@ mod pipe;
 mod qemu;
 mod report;
 mod script;
-pub mod systemd;
+mod systemd;
 mod table;
 
 use std::path::PathBuf;
@@ -25,38 +25,88 @@ use kernel::GuestKernel;
 use qemu::GuestClock;
 use table::{GuestTest, TESTS};
 
-/// Runs the given tests, or all.
-pub fn guest(names: &[&str]) -> Done {
+/// Runs the given tests of the drivers, or all.
+pub fn drivers(names: &[&str]) -> Done {
     let tests = chosen(names)?;
-    packages::install()?;
-    let folder = target().join("guest");
-    let kernel = GuestKernel::fetch(&folder)?;
-    let executables = build(&tests)?;
-    let began = Instant::now();
-    let run = folder.join("run");
-    let _ = std::fs::remove_dir_all(&run);
-    for Executable { test, name, path } in &executables {
-        let folder = run.join(test);
-        let placed = std::fs::create_dir_all(&folder).and_then(|()| std::fs::copy(path, folder.join(name)));
-        placed.map_err(|error| format!("{}: {error}", folder.join(name).display()))?;
+    Ready::make()?.drivers(&tests)
+}
+
+/// Runs the package under systemd.
+pub fn systemd() -> Done {
+    Ready::make()?.systemd()
+}
+
+/// Runs both guests at once: emulation takes little more than a core each.
+pub fn both() -> Done {
+    let (tests, ready) = (chosen(&[])?, Ready::make()?);
+    let (drivers, systemd) = std::thread::scope(|scope| {
+        let drivers = scope.spawn(|| ready.drivers(&tests));
+        let systemd = ready.systemd();
+        (drivers.join().unwrap_or_else(|_| Err("panicked; see above".to_owned())), systemd)
+    });
+    let errors = [("kernel guest", drivers), ("systemd guest", systemd)];
+    let errors = errors.into_iter().filter_map(|(name, done)| Some(format!("{name}: {}", done.err()?)));
+    match errors.collect::<Vec<_>>().join("\n") {
+        none if none.is_empty() => Ok(()),
+        errors => Err(errors),
     }
-    initramfs::write(&run.join("initramfs"), &kernel, &initramfs::BOOT_MODULES, initramfs::INIT)?;
-    println!("kernel guest: Linux {}, {} tests", kernel.release(), tests.len());
-    let mut checks = 0;
-    for clock in [GuestClock::Instructions, GuestClock::Host] {
-        let tests: Vec<_> = tests.iter().copied().filter(|test| test.clock() == clock).collect();
-        if tests.is_empty() {
-            continue;
+}
+
+/// What every guest needs.
+struct Ready {
+    /// What guests leave is in folders of theirs in it.
+    folder: PathBuf,
+    kernel: GuestKernel,
+    /// Built by the very command of `cargo xtask test`, so that both share build artifacts: selecting single tests would
+    /// resolve other features of the dependencies and build them again.
+    binaries: Vec<Binary>,
+}
+
+impl Ready {
+    fn make() -> Done<Self> {
+        packages::install()?;
+        let folder = target().join("guest");
+        let kernel = GuestKernel::fetch(&folder)?;
+        Ok(Self { folder, kernel, binaries: binaries::build()? })
+    }
+
+    fn drivers(&self, tests: &[&GuestTest]) -> Done {
+        let began = Instant::now();
+        let run = self.folder.join("run");
+        let _ = std::fs::remove_dir_all(&run);
+        for GuestTest { name: test, programs, .. } in tests {
+            let folder = run.join(test);
+            std::fs::create_dir_all(&folder).map_err(|error| format!("{}: {error}", folder.display()))?;
+            let programs = programs.iter().map(|name| (*name, find(&self.binaries, name, false)));
+            for (name, path) in [("test", find(&self.binaries, test, true))].into_iter().chain(programs) {
+                let copy = folder.join(name);
+                std::fs::copy(path?, &copy).map_err(|error| format!("{}: {error}", copy.display()))?;
+            }
         }
-        let script = run.join("run.sh");
-        std::fs::write(&script, script::script(&tests))
-            .map_err(|error| format!("{}: {error}", script.display()))?;
-        let mut machine = qemu::Machine::start(&kernel, &run, &tests, clock)?;
-        let names: Vec<&str> = tests.iter().map(|test| test.name).collect();
-        checks += report::follow(&mut machine, &run, &names, script::TEST_LIMIT_S)?;
+        initramfs::write(&run.join("initramfs"), &self.kernel, &initramfs::BOOT_MODULES, initramfs::INIT)?;
+        println!("kernel guest: Linux {}, {} tests", self.kernel.release(), tests.len());
+        let mut checks = 0;
+        for clock in [GuestClock::Instructions, GuestClock::Host] {
+            let tests: Vec<_> = tests.iter().copied().filter(|test| test.clock() == clock).collect();
+            if tests.is_empty() {
+                continue;
+            }
+            let script = run.join("run.sh");
+            std::fs::write(&script, script::script(&tests))
+                .map_err(|error| format!("{}: {error}", script.display()))?;
+            let mut machine = qemu::Machine::start(&self.kernel, &run, &tests, clock)?;
+            let names: Vec<&str> = tests.iter().map(|test| test.name).collect();
+            checks += report::follow(&mut machine, &run, &names, script::TEST_LIMIT_S)?;
+        }
+        println!("kernel guest: {checks} checks passed in {:.0} s", began.elapsed().as_secs_f64());
+        Ok(())
     }
-    println!("kernel guest: {checks} checks passed in {:.0} s", began.elapsed().as_secs_f64());
-    Ok(())
+
+    fn systemd(&self) -> Done {
+        let daemon = find(&self.binaries, "raysweepd", false)?;
+        let programs = daemon.parent().ok_or("raysweepd in no folder")?;
+        systemd::run(&self.folder, &self.kernel, programs)
+    }
 }
 
 /// Message when the guests are skipped on request.
@@ -76,44 +126,10 @@ fn chosen(names: &[&str]) -> Done<Vec<&'static GuestTest>> {
     Ok(TESTS.iter().filter(|test| names.is_empty() || names.contains(&test.name)).collect())
 }
 
-/// A test or program to copy to a test's folder.
-struct Executable {
-    test: &'static str,
-    name: &'static str,
-    path: PathBuf,
-}
-
-/// Builds the tests by the very command of `cargo xtask test`, so that both share build artifacts: selecting single
-/// tests would resolve other features of the dependencies and build them again.
-fn build(tests: &[&GuestTest]) -> Done<Vec<Executable>> {
-    let binaries = binaries::build()?;
-    let mut all = Vec::new();
-    for GuestTest { name: test, programs, .. } in tests {
-        all.push(Executable { test, name: "test", path: find(&binaries, test, true)? });
-        for name in *programs {
-            all.push(Executable { test, name, path: find(&binaries, name, false)? });
-        }
-    }
-    Ok(all)
-}
-
 /// The path of a test, or of a program, whose own unit tests have its name too.
 fn find(binaries: &[Binary], name: &str, is_test: bool) -> Done<PathBuf> {
     let found = binaries.iter().find(|binary| binary.is_test == is_test && binary.name() == name);
     found.map(|binary| binary.path.clone()).ok_or_else(|| format!("cargo built no {name}"))
-}
-
-/// Builds programs with the tests of the daemon, and so with what `cargo xtask test` has built; returns their folder.
-fn build_programs(names: &[&str]) -> Done<PathBuf> {
-    let test =
-        TESTS.iter().find(|test| test.programs.contains(&"raysweepd")).ok_or("no test of the daemon")?;
-    let built = build(&[test])?;
-    let daemon = built.iter().find(|built| built.name == "raysweepd").ok_or("cargo built no raysweepd")?;
-    let folder = daemon.path.parent().ok_or("raysweepd in no folder")?;
-    match names.iter().find(|name| !folder.join(name).exists()) {
-        Some(missing) => Err(format!("cargo built no {missing} in {}", folder.display())),
-        None => Ok(folder.to_owned()),
-    }
 }
 
 #[cfg(test)]

@@ -19,8 +19,7 @@ use super::kernel::GuestKernel;
 use super::qemu::{GuestClock, Machine};
 use super::report;
 use crate::daemon::Daemon;
-use crate::packages;
-use crate::run::{Done, run, target};
+use crate::run::{self, Done};
 use crate::{deb, rootfs};
 
 const PRELUDE: &str = include_str!("prelude.sh");
@@ -90,18 +89,14 @@ const MASKED: [&str; 17] = [
     "fstrim.timer",
 ];
 
-/// Runs all stages, or says why this machine does not permit it.
-pub fn systemd() -> Done {
-    packages::install()?;
+/// Runs all stages with the package of these programs, or says why this machine does not permit it.
+pub fn run(folder: &Path, kernel: &GuestKernel, programs: &Path) -> Done {
     if let Some(why) = rootfs::forbidden() {
         println!("systemd guest: SKIPPED: {why}");
         return Ok(());
     }
-    let folder = target().join("guest");
-    let kernel = GuestKernel::fetch(&folder)?;
-    let programs = super::build_programs(&deb::PROGRAMS)?;
     let began = Instant::now();
-    let guest = Guest::prepare(&folder, kernel, &programs)?;
+    let guest = Guest::prepare(folder, kernel, programs)?;
     let mut checks = guest.run(&SERVICE)?;
     let installed = guest.disk.with_extension("installed");
     disk::copy(&guest.disk, &installed)?;
@@ -110,14 +105,14 @@ pub fn systemd() -> Done {
     checks += guest.run(&BOOT)?;
 
     std::fs::rename(&installed, &guest.disk).map_err(|error| format!("{}: {error}", installed.display()))?;
-    checks += guest.power_losses(&programs)?;
+    checks += guest.power_losses(programs)?;
     println!("systemd guest: {checks} checks passed in {:.0} s", began.elapsed().as_secs_f64());
     Ok(())
 }
 
 /// The guest's disk and what it shares with this machine.
-struct Guest {
-    kernel: GuestKernel,
+struct Guest<'a> {
+    kernel: &'a GuestKernel,
     /// The folder in which QEMU runs.
     run: PathBuf,
     disk: PathBuf,
@@ -125,8 +120,8 @@ struct Guest {
     share: PathBuf,
 }
 
-impl Guest {
-    fn prepare(folder: &Path, kernel: GuestKernel, programs: &Path) -> Done<Self> {
+impl<'a> Guest<'a> {
+    fn prepare(folder: &Path, kernel: &'a GuestKernel, programs: &Path) -> Done<Self> {
         let folder = folder.join("systemd");
         let run = folder.join("run");
         let share = run.join("share");
@@ -137,9 +132,9 @@ impl Guest {
         }
         let package = deb::package(programs, &folder.join("deb"))?;
         deb::copy(&package, &share.join("raysweep.deb"))?;
-        initramfs::write(&run.join("initramfs"), &kernel, &BOOT_MODULES, INIT)?;
+        initramfs::write(&run.join("initramfs"), kernel, &BOOT_MODULES, INIT)?;
         let disk = run.join("disk");
-        disk::make(&folder, &kernel, &disk)?;
+        disk::make(&folder, kernel, &disk)?;
         println!("systemd guest: Linux {}, {}", kernel.release(), package.display());
         Ok(Self { kernel, run, disk, share })
     }
@@ -154,11 +149,11 @@ impl Guest {
 
     /// Boots and kills the machine in the middle of a run.
     fn cut(&self) -> Done {
-        let machine = self.boot(&CUT, None)?;
+        let mut machine = self.boot(&CUT, None)?;
         let midway = self.share.join(CUT.name).join("midway");
         let began = Instant::now();
         while !midway.exists() {
-            if began.elapsed() > Duration::from_secs(STAGE_LIMIT_S.into()) {
+            if machine.has_ended() || began.elapsed() > Duration::from_secs(STAGE_LIMIT_S.into()) {
                 return Err(format!(
                     "the guest has begun no run; its log is {}",
                     midway.with_file_name("log").display()
@@ -211,11 +206,13 @@ impl Guest {
         let _ = std::fs::remove_dir_all(&data);
         std::fs::create_dir_all(&data).map_err(|error| format!("{}: {error}", data.display()))?;
         let dump = format!("rdump /var/lib/raysweep {}", data.display());
-        run(Command::new("debugfs")
-            .args(["-R", &dump])
-            .arg(&self.disk)
-            .stdout(Stdio::null())
-            .stderr(Stdio::null()))?;
+        run::run(
+            Command::new("debugfs")
+                .args(["-R", &dump])
+                .arg(&self.disk)
+                .stdout(Stdio::null())
+                .stderr(Stdio::null()),
+        )?;
         let data = data.join("raysweep");
         let daemon = Daemon::start(programs, &self.share.join("rig.toml"), &data)?;
         let resumed = Command::new(programs.join("raysweep"))
@@ -247,13 +244,13 @@ impl Guest {
         let script = self.share.join("run.sh");
         let text = PRELUDE.replacen('\n', &format!("\nSTAGE={}\n", stage.name), 1);
         write(&script, &format!("{text}{}", stage.script))?;
-        run(Command::new("chmod").arg("755").arg(&script))?;
+        run::run(Command::new("chmod").arg("755").arg(&script))?;
         let masks: String = MASKED.iter().map(|unit| format!(" systemd.mask={unit}")).collect();
         let arguments = format!(
             "console=ttyS0 panic=-1 clocksource=hpet mitigations=off quiet systemd.run=/share/run.sh \
              systemd.run_success_action=poweroff-force systemd.run_failure_action=poweroff-force{masks}"
         );
-        let mut qemu = Machine::command(&self.kernel, &self.run, &arguments)?;
+        let mut qemu = Machine::command(self.kernel, &self.run, &arguments)?;
         qemu.args(GuestClock::Host.arguments());
         match log {
             None => qemu.args(["-drive", "if=none,id=d0,format=raw,cache=unsafe,file=disk"]),

@@ -125,17 +125,19 @@ stopped() {
 }
 check "a stop ends the run in order, and resume completes it to the same bits" stopped
 
+hangs() {
+    pid=$(property MainPID)
+    sleep 12
+    [ "$(property MainPID)" = "$pid" ] || { echo "ended although it does not hang"; return 1; }
+    begin && kill -STOP "$pid" && code 4 wait $client && await is_active && await is_complete && same_bits &&
+        journalctl -u raysweepd.service | grep -q "result 'watchdog'"
+}
 watchdog() {
     printf '[Service]\nWatchdogSec=10\n' >/etc/systemd/system/raysweepd.service.d/watchdog.conf
-    systemctl daemon-reload && systemctl restart raysweepd.service && pid=$(property MainPID)
-    sleep 12
-    [ "$(property MainPID)" = "$pid" ] || return 1
-    begin && kill -STOP "$pid" && code 4 wait $client && await is_active && await is_complete && same_bits || return 1
-    journalctl -u raysweepd.service | grep -q "result 'watchdog'"
+    systemctl daemon-reload && systemctl restart raysweepd.service && hangs
     found=$?
     rm /etc/systemd/system/raysweepd.service.d/watchdog.conf
-    systemctl daemon-reload && systemctl restart raysweepd.service
-    return $found
+    systemctl daemon-reload && systemctl restart raysweepd.service && return $found
 }
 check "the watchdog ends a daemon that hangs (SIGSTOP), and the run completes" watchdog
 
