@@ -52,7 +52,13 @@ pub fn calibrations_in(data: &Path) -> raysweep_session::Result<Vec<CalibrationI
         let name = session.dir.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let (header, problem) = match CalibrationHeader::read(&session.dir) {
             Ok(header @ Some(_)) => (header, None),
-            Ok(None) => (None, Some("its run did not succeed: see its report and ledger".into())),
+            Ok(None) => {
+                let why = match session.end {
+                    None => "its run has not ended",
+                    Some(_) => "its run did not succeed: see its report and ledger",
+                };
+                (None, Some(why.into()))
+            }
             Err(problem) => (None, Some(problem)),
         };
         CalibrationInfo {

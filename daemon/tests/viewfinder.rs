@@ -215,6 +215,33 @@ fn a_paused_one_ends_after_its_time_too() {
 }
 
 #[test]
+fn light_is_turned_off_in_a_pause_too_and_only_time_with_light_counts() {
+    let mut view = View::new(PLANE, "seconds = 3\n");
+    view.picture(|_| true);
+    view.runner.pause().unwrap();
+    view.show(FinderPicture::Black);
+    let began = Instant::now();
+    while view.told.lock().unwrap().last() != Some(&None) {
+        assert!(began.elapsed() < HUNG, "the projector is still lit");
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    let lit_s = began.elapsed().as_secs_f64() + 1.0;
+    assert_eq!(view.runner.status().state, RunState::Paused);
+    assert_eq!(view.end(), ("complete".into(), None));
+    let light_s = |view: &View| {
+        let dir = view.runner.status().session.unwrap();
+        Session::open(&dir).unwrap().state().unwrap().end.unwrap().light_s.unwrap()
+    };
+    let of_most = light_s(&view);
+    assert!(of_most > 0.0 && of_most < 3.0_f64.min(lit_s + 1.0), "{of_most} s of light");
+    for rig in [PLANE, DOTS] {
+        let mut dark = View::new(rig, "picture = \"black\"\nseconds = 0.3\n");
+        assert_eq!(dark.end(), ("complete".into(), None));
+        assert_eq!(light_s(&dark), 0.0);
+    }
+}
+
+#[test]
 fn what_keeps_it_from_showing_more_is_said() {
     // A scene from a file is known by its rows.
     let scene = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/data/p2r_corner.npz");

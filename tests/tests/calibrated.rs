@@ -270,11 +270,18 @@ fn light_that_comes_later_than_calibrated_is_corrected_or_said_to_have_moved() {
     let (error, summary) = late(3.1);
     assert!(error < 0.02 && (summary.findings.late_us.unwrap() - 3.1).abs() < 0.3);
     assert!(summary.warnings[0].contains("us later than calibrated"), "{:?}", summary.warnings);
-    // 7 us are 0.3 rows.
-    let (error, summary) = late(7.0);
+    // As far as a busy host mistakes the clocks of camera and watcher: half a row.
+    let (error, summary) = late(10.8);
+    assert!(error < 0.02 && (summary.findings.late_us.unwrap() - 10.8).abs() < 0.6);
+    assert!(
+        summary.warnings[0].contains("us later than calibrated, which is corrected"),
+        "{:?}",
+        summary.warnings
+    );
+    // No exposure begins or ends near light that is as late as half a row, so that it is found by its place alone.
+    let (error, summary) = late(12.0);
     assert!(error > 0.1 && summary.findings.late_us == Some(0.0));
-    assert!(summary.warnings[0].contains("the rig has moved: calibrate again"), "{:?}", summary.warnings);
-    assert!(summary.warnings[1].contains("row from its place: the rig has moved"), "{:?}", summary.warnings);
+    assert!(summary.warnings[0].contains("row from its place: the rig has moved"), "{:?}", summary.warnings);
 }
 
 #[test]

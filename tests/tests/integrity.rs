@@ -332,6 +332,37 @@ fn a_damaged_product_is_not_certified_and_not_copied() {
 }
 
 #[test]
+fn a_manifest_that_is_gone_and_what_no_session_contains_are_damage() {
+    let bench = small_bench();
+    let folder = completed(&bench, SWEEP);
+    let damaged = || {
+        let (_, audit) = Audit::of(&Session::open(&folder).unwrap()).unwrap();
+        audit.damage.iter().map(ToString::to_string).collect::<Vec<_>>()
+    };
+    let to = bench.folder.path().join("copy");
+    let refused = || export(&folder, &to, false, ExportScope::Results).unwrap_err().to_string();
+
+    std::os::unix::fs::symlink("/etc/hostname", folder.join("products/link")).unwrap();
+    let [link] = &damaged()[..] else { panic!("{:?}", damaged()) };
+    assert!(link.starts_with("products/link is damaged (it is a symbolic link"), "{link}");
+    fs::remove_file(folder.join("products/link")).unwrap();
+
+    damage(&folder.join("products/epipolar.npy"));
+    fs::remove_file(folder.join("manifest.json")).unwrap();
+    assert_eq!(damaged(), ["manifest.json is damaged (it is missing)"]);
+    assert!(refused().contains("manifest.json") && !to.exists(), "{}", refused());
+    process(&folder).unwrap();
+    assert_eq!(damaged(), [""; 0]);
+
+    // A sparse file, which would take minutes to read.
+    fs::File::options().write(true).open(folder.join("plan.toml")).unwrap().set_len(1 << 40).unwrap();
+    fs::File::options().write(true).open(folder.join("report.html")).unwrap().set_len(1 << 40).unwrap();
+    let found = damaged();
+    assert!(found.len() == 2 && found[0].starts_with("plan.toml"), "{found:?}");
+    assert!(found[1].contains("its size is not the one in the manifest"), "{found:?}");
+}
+
+#[test]
 fn an_edited_plan_is_refused_until_it_is_accepted_and_never_with_other_points() {
     let bench = small_bench();
     let folder = completed(&bench, SWEEP);

@@ -9,8 +9,8 @@ use raysweep_transport::plane::{RowTiming, Setting};
 const NEAR_US: f64 = 2.0;
 /// Standard errors within which a latency may be off by chance.
 const DOUBT: f64 = 2.0;
-/// One still further is not adopted: the rig, or something before it, has moved.
-const ADOPTED_US: f64 = 5.0;
+/// One that is off by more standard errors is adopted however uncertain it is.
+const BEYOND_DOUBT: f64 = 5.0;
 /// One less certain than this is adopted only if the calibration's own is less certain still.
 const CERTAIN_US: f64 = 0.5;
 /// Direct light further from its place causes a warning.
@@ -60,17 +60,15 @@ impl CalibrationDrift {
                 let (late_us, sd_us) = (found.late_us, found.standard_error_us);
                 let than = if late_us < 0.0 { "earlier" } else { "later" };
                 let comes = format!("light comes {:.2} us {than} than calibrated", late_us.abs());
-                let is_certain = sd_us <= known_us.max(CERTAIN_US);
-                let doubt_us = if is_certain { 0.0 } else { DOUBT * sd_us };
-                if late_us.abs() > ADOPTED_US + doubt_us {
-                    self.warnings.push(format!(
-                        "{comes}, too much to be corrected: the times of the calibration are kept, but the rig has moved: calibrate again"
-                    ));
-                } else if is_certain {
+                let is_certain = sd_us <= known_us.max(CERTAIN_US) || late_us.abs() > BEYOND_DOUBT * sd_us;
+                // A rig that has moved is described as well by another latency: both move all light alike.
+                if is_certain {
                     self.late_us = late_us;
                     self.late_sd_us = Some(sd_us);
                     if late_us.abs() > NEAR_US + DOUBT * sd_us {
-                        self.warnings.push(format!("{comes}: calibrate again soon"));
+                        self.warnings.push(format!(
+                            "{comes}, which is corrected: the rig has moved, or the host was too busy to tell the clocks apart; calibrate again"
+                        ));
                     }
                 }
                 let kept = if is_certain { "" } else { ", too uncertain to be used" };

@@ -117,7 +117,8 @@ impl Written {
 
 /// The damaged results that are there.
 fn results_before(session: &Session, damage: &[Damage]) -> Result<Vec<DamagedResult>, ProcessError> {
-    if damage.is_empty() {
+    // Without a manifest, nothing says how a result should be.
+    if damage.is_empty() || !session.manifest_path().exists() {
         return Ok(Vec::new());
     }
     let recorded = manifest::read(session)?.files;

@@ -18,6 +18,10 @@ pub struct ViewfinderParams {
     /// Exposure of each frame.
     #[serde(default)]
     pub exposure_us: Option<f64>,
+    /// Delay of each exposure, as in a sweep: 0 is centred on the light of a row's own projector row. On a plane rig whose
+    /// camera is triggered.
+    #[serde(default)]
+    pub delay_us: Option<f64>,
 }
 
 /// A picture of a viewfinder; the image `viewfinder` itself is in the live file. Counts are those of the camera, and
@@ -32,6 +36,9 @@ pub struct ViewfinderValues {
     pub picture: FinderPicture,
     /// Exposure of the frame.
     pub exposure_us: f64,
+    /// Its delay; 0 on a dot rig.
+    #[serde(default)]
+    pub delay_us: f64,
     /// First row, row after the last, first column, column after the last.
     pub region: [usize; 4],
     /// Count without light.

@@ -17,7 +17,7 @@ use crate::stack::{Contents, Stack};
 use crate::{Error, Result, durable, input};
 
 /// Longest text of a session that is read at once: the socket takes plans of at most 1 MiB.
-const MOST_TEXT_BYTES: u64 = 1 << 24;
+pub(crate) const MOST_TEXT_BYTES: u64 = 1 << 24;
 /// Maximum bytes of a session's name that are used in its folder's name.
 const NAME_MAX_BYTES: usize = 64;
 

@@ -14,10 +14,10 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 pub use crate::damage::{Damage, DamagedPart};
-use crate::folder::Session;
-use crate::ledger::{LedgerText, PointEntry, State};
+use crate::folder::{MOST_TEXT_BYTES, Session};
+use crate::ledger::{EndState, LedgerText, PointEntry, State};
 use crate::manifest::{self, FileRecord, Manifest};
-use crate::stack::{ArrayName, crc32};
+use crate::stack::{ArrayName, Contents, crc32};
 use crate::{Error, Result, film, input};
 
 /// The result of checking all checksums of a session.
@@ -77,6 +77,7 @@ impl Audit {
     fn add_manifest(&mut self, session: &Session, state: &State, lines_are_sound: bool) -> Result<()> {
         self.has_manifest = session.manifest_path().exists();
         if !self.has_manifest {
+            self.damage.extend(missing_manifest(state));
             return Ok(());
         }
         let recorded = match manifest::read(session) {
@@ -87,7 +88,15 @@ impl Audit {
             }
         };
         let found = manifest::paths_of(session)?;
-        self.added = found.keys().filter(|file| !recorded.contains_key(*file)).cloned().collect();
+        let added = found.iter().filter(|(file, _)| !recorded.contains_key(*file));
+        for (file, path) in added {
+            self.added.push(file.clone());
+            // Whatever it leads to is no part of the session.
+            if let Err(why) = input::open_itself(path, u64::MAX) {
+                let part = DamagedPart::Result { file: file.clone() };
+                self.damage.push(Damage { part, why: why.to_string() });
+            }
+        }
         let compare = |(file, record): (&String, &FileRecord)| {
             let why = match found.get(file) {
                 // Lines are appended after the manifest was written, and those with damage have been named.
@@ -95,7 +104,10 @@ impl Audit {
                     (lines_are_sound && !begins_with(path, record)?).then(|| SHORTENED.into())
                 }
                 _ if state.files().contains_key(file) || is_data(file) => None,
-                Some(path) => why_unlike(path, &record.sha256, NOT_OF_MANIFEST)?,
+                Some(path) => match std::fs::symlink_metadata(path) {
+                    Ok(found) if found.is_file() && found.len() != record.bytes => Some(OTHER_SIZE.into()),
+                    _ => why_unlike(path, &record.sha256, NOT_OF_MANIFEST)?,
+                },
                 None => Some(MISSING.into()),
             };
             let file = file.clone();
@@ -112,11 +124,21 @@ impl Audit {
 }
 
 const LEDGER: &str = "ledger.jsonl";
+const MANIFEST: &str = "manifest.json";
 const MISSING: &str = "it is missing";
 const NOT_OF_LEDGER: &str = "its SHA-256 is not the one in the ledger";
 const NOT_OF_MANIFEST: &str = "its SHA-256 is not the one in the manifest";
 const SHORTENED: &str = "it does not begin with the lines that it had when the manifest was written";
+const OTHER_SIZE: &str = "its size is not the one in the manifest";
 const OTHER_CRC: &str = "its checksum differs from the ledger's";
+
+/// A session that is complete and has results also has a manifest.
+fn missing_manifest(state: &State) -> Option<Damage> {
+    let is_complete = state.end.as_ref().is_some_and(|end| end.state == EndState::Complete);
+    let part = DamagedPart::Result { file: MANIFEST.into() };
+    (is_complete && state.session.shape.contents != Contents::Nothing)
+        .then(|| Damage { part, why: MISSING.into() })
+}
 
 /// Whether the CRC-32 of a file's content is in the ledger.
 fn is_data(file: &str) -> bool {
@@ -150,7 +172,13 @@ fn begins_with(path: &Path, record: &FileRecord) -> Result<bool> {
 pub fn changed_inputs(session: &Session, state: &State) -> Result<Vec<Damage>> {
     let mut changed = Vec::new();
     for (file, sha256) in state.files() {
-        let why = why_unlike(&session.dir().join(file), sha256, NOT_OF_LEDGER)?;
+        let path = session.dir().join(file);
+        // What no plan or rig file can be need not be read to its end.
+        let is_text = file.ends_with(".toml");
+        let why = match std::fs::symlink_metadata(&path) {
+            Ok(found) if is_text && found.len() > MOST_TEXT_BYTES => Some(NOT_OF_LEDGER.into()),
+            _ => why_unlike(&path, sha256, NOT_OF_LEDGER)?,
+        };
         let part = DamagedPart::Input { file: file.clone() };
         changed.extend(why.map(|why| Damage { part, why }));
     }
@@ -166,7 +194,10 @@ pub fn damaged_files(session: &Session, state: &State, files: &[String]) -> Resu
     let mut damage = Vec::new();
     let recorded = match manifest::read(session) {
         Ok(Manifest { files, .. }) => files,
-        Err(Error::Io { source, .. }) if source.kind() == ErrorKind::NotFound => Default::default(),
+        Err(Error::Io { source, .. }) if source.kind() == ErrorKind::NotFound => {
+            damage.extend(missing_manifest(state));
+            Default::default()
+        }
         Err(error) => {
             damage.push(Damage { part: DamagedPart::Manifest, why: error.to_string() });
             Default::default()

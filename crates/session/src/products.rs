@@ -190,24 +190,31 @@ impl Products {
     /// Reads back an image written by [`Products::image`].
     ///
     /// # Errors
-    /// [`Error::Io`] if it is missing, [`Error::Codec`] if it is damaged.
+    /// As [`Products::read_array`], and [`Error::Shape`] if it has other axes.
     pub fn read_image(&self, name: &str) -> Result<Array2<f32>> {
-        let path = self.path(name, "npy")?;
-        let bytes = input::read_open(&self.open(&path)?, u64::MAX).map_err(Error::io("read", &path))?;
-        ndarray_npy::ReadNpyExt::read_npy(bytes.as_slice()).map_err(Error::codec("read", path.display()))
+        let array = self.read_array(name)?;
+        let found = array.shape().to_vec();
+        array.into_dimensionality().map_err(|_other_axes| Error::Shape {
+            what: format!("product `{name}`"),
+            found,
+            allowed: "[t, s]".into(),
+        })
     }
 
     /// Reads back the array of a product, with any number of axes.
     ///
     /// # Errors
-    /// [`Error::Io`] if it is missing, [`Error::Codec`] if it is damaged.
+    /// [`Error::Io`] if it is missing or too large for the memory, [`Error::Codec`] if it is damaged.
     pub fn read_array(&self, name: &str) -> Result<ArrayD<f32>> {
         let path = self.path(name, "npy")?;
         let failed = || Error::io("read", &path);
         let mut file = self.open(&path)?;
         let length = usize::try_from(file.metadata().map_err(failed())?.len()).unwrap_or(usize::MAX);
         // Aligned for the view, which compares the header with the length before anything is allocated for it.
-        let mut aligned = vec![0_f32; length.div_ceil(size_of::<f32>())];
+        let mut aligned: Vec<f32> = Vec::new();
+        let values = length.div_ceil(size_of::<f32>());
+        aligned.try_reserve_exact(values).map_err(|_full| failed()(io::ErrorKind::OutOfMemory.into()))?;
+        aligned.resize(values, 0.0);
         let bytes: &mut [u8] = &mut bytemuck::cast_slice_mut(&mut aligned)[..length];
         io::Read::read_exact(&mut file, bytes).map_err(failed())?;
         let view = ArrayViewD::<f32>::view_npy(bytes).map_err(Error::codec("read", path.display()))?;

@@ -63,7 +63,8 @@ impl Session {
         durable::create_dir_all(folder)?;
         let target = folder.join(dir.file_name().unwrap_or_default());
         if target.exists() {
-            return Err(Error::io("replace", &target)(io::ErrorKind::AlreadyExists.into()));
+            let why = "a session of this name is there; move or rename it first";
+            return Err(Error::io("replace", &target)(io::Error::new(io::ErrorKind::AlreadyExists, why)));
         }
         fs::rename(dir, &target).map_err(moved(dir))?;
         Ok(target)

@@ -89,7 +89,7 @@ fn changelog() -> Done<String> {
     let git = |arguments: &[&str]| output(Command::new("git").args(arguments).current_dir(root()));
     let (commits, date) = (git(&["rev-list", "--count", "HEAD"])?, git(&["log", "-1", "--format=%aD"])?);
     Ok(format!(
-        "raysweep ({}+{}) unstable; urgency=medium\n\n  * See changelog.gz.\n\n -- raysweep developers <raysweep@localhost>  {}\n",
+        "raysweep ({}+{}) unstable; urgency=medium\n\n  * See changelog.gz.\n\n -- raysweep developers <developers@raysweep.example.org>  {}\n",
         env!("CARGO_PKG_VERSION"),
         commits.trim(),
         date.trim()

@@ -51,12 +51,13 @@ pub(super) fn expose(socket: &Path, path: &Path, printer: Printer) -> Result<Exi
         }
         None => text,
     };
-    let exposures_us = Plan::parse(&text).ok().and_then(|plan| exposures(&plan.procedure));
-    let Some((shortest_us, longest_us)) = exposures_us else {
+    let asked = Plan::parse(&text).ok();
+    let asked = asked.and_then(|plan| Some((exposures(&plan.procedure)?, delays(&plan.procedure))));
+    let Some(((shortest_us, longest_us), delays_us)) = asked else {
         let message = "the plan has no exposures to choose: give a plan of kind \"sweep\" or \"film\"";
         return Err(CommandFailure::Exposure(message.into()));
     };
-    let tried = Trial::begin(socket)?.longest(shortest_us, longest_us)?;
+    let tried = Trial::begin(socket)?.longest(shortest_us, longest_us, &delays_us)?;
     let limited = limited(&text, tried.exposure_us)?;
     let foreseen = client.check(&limited).map_err(|error| CommandFailure::of_plan(error, path, &limited))?;
     let (plan, average) = averaged(&limited, &foreseen)?;
@@ -67,6 +68,18 @@ pub(super) fn expose(socket: &Path, path: &Path, printer: Printer) -> Result<Exi
     let proposal = Proposed { tried, longest_us, average, report, plan };
     printer.print(&proposal.value(), |_| proposal.text())?;
     Ok(Exit::Done)
+}
+
+/// The delays of a plan.
+fn delays(procedure: &Procedure) -> Vec<f64> {
+    match procedure {
+        Procedure::Sweep(sweep) => {
+            let extra = sweep.extra.iter().flat_map(|grid| grid.delay_us.values());
+            sweep.delay_us.values().into_iter().chain(extra).collect()
+        }
+        Procedure::Film(film) => film.delay_us.values(),
+        _ => Vec::new(),
+    }
 }
 
 /// The shortest and the longest exposure of a plan.
@@ -177,6 +190,8 @@ struct Trial {
     events: Subscription,
     interrupts: Interrupts,
     pictures: u64,
+    /// Exposure and delay asked for.
+    settings_us: Option<(f64, f64)>,
     /// The viewfinder's session.
     session: PathBuf,
     is_over: bool,
@@ -189,18 +204,49 @@ impl Trial {
         let client = Client::connect(socket)?;
         let plan = RunParams { plan: VIEWFINDER.into(), attached: true, ..RunParams::default() };
         let session = events.client().run(&plan)?.session;
-        let mut trial = Self { client, events, interrupts, pictures: 0, session, is_over: false };
-        trial.picture(None)?;
+        let mut trial =
+            Self { client, events, interrupts, pictures: 0, settings_us: None, session, is_over: false };
+        trial.picture()?;
         Ok(trial)
     }
 
-    /// The longest exposure that leaves at most [`MAX_SATURATED`] of the pixels saturated.
-    fn longest(mut self, shortest_us: f64, longest_us: f64) -> Result<Tried, CommandFailure> {
-        let longest = self.look(longest_us)?;
+    /// The longest exposure that leaves at most [`MAX_SATURATED`] of the pixels saturated at each delay.
+    fn longest(
+        mut self,
+        shortest_us: f64,
+        longest_us: f64,
+        delays_us: &[f64],
+    ) -> Result<Tried, CommandFailure> {
+        let mut over_us = longest_us;
+        loop {
+            // Indirect light may be brightest at any delay.
+            let mut brightest = (f64::INFINITY, 0.0);
+            for &delay_us in delays_us {
+                let headroom = headroom_of(&self.picture_of(over_us, delay_us)?);
+                brightest = if headroom < brightest.0 { (headroom, delay_us) } else { brightest };
+            }
+            let (_, delay_us) = brightest;
+            let found = self.longest_at(delay_us, shortest_us, over_us)?;
+            // Where another delay is the brightest in that exposure, it is tried again.
+            if found.exposure_us == over_us || found.exposure_us <= shortest_us {
+                return Ok(found);
+            }
+            over_us = found.exposure_us;
+        }
+    }
+
+    /// The longest exposure that leaves at most [`MAX_SATURATED`] of the pixels saturated at a delay.
+    fn longest_at(
+        &mut self,
+        delay_us: f64,
+        shortest_us: f64,
+        longest_us: f64,
+    ) -> Result<Tried, CommandFailure> {
+        let longest = self.look(longest_us, delay_us)?;
         if longest.suits {
             return Ok(longest);
         }
-        let mut best = self.look(shortest_us)?;
+        let mut best = self.look(shortest_us, delay_us)?;
         if !best.suits {
             return Err(CommandFailure::Exposure(format!(
                 "{:.3} % of the pixels saturate even in the plan's shortest exposure, {shortest_us} us, and at most {:.2} % may: shorter exposures do not dim the light of a pixel's own row, which is a flash; close the aperture by a stop (or lower the gain by 2), set camera.white_dn to match, and try again",
@@ -215,7 +261,7 @@ impl Trial {
             if middle_us <= best.exposure_us || middle_us >= over_us {
                 break;
             }
-            let middle = self.look(middle_us)?;
+            let middle = self.look(middle_us, delay_us)?;
             match middle.suits {
                 true => best = middle,
                 false => over_us = middle_us,
@@ -225,14 +271,10 @@ impl Trial {
     }
 
     /// Judges an exposure by several pictures.
-    fn look(&mut self, exposure_us: f64) -> Result<Tried, CommandFailure> {
-        self.client.viewfinder(&ViewfinderParams {
-            exposure_us: Some(exposure_us),
-            ..ViewfinderParams::default()
-        })?;
+    fn look(&mut self, exposure_us: f64, delay_us: f64) -> Result<Tried, CommandFailure> {
         let (mut samples, mut saturated, mut headroom) = (0.0, 0.0, f64::INFINITY);
         for _ in 0..PICTURES {
-            let values = self.picture(Some(exposure_us))?;
+            let values = self.picture_of(exposure_us, delay_us)?;
             let pixels = values.histogram.iter().sum::<u64>() as f64;
             samples += pixels;
             saturated += values.saturated * pixels;
@@ -243,8 +285,19 @@ impl Trial {
         Ok(Tried { exposure_us, saturated: saturated / samples, suits, headroom })
     }
 
-    /// The next picture, of this exposure.
-    fn picture(&mut self, exposure_us: Option<f64>) -> Result<ViewfinderValues, CommandFailure> {
+    /// The next picture of this exposure and delay.
+    fn picture_of(&mut self, exposure_us: f64, delay_us: f64) -> Result<ViewfinderValues, CommandFailure> {
+        if self.settings_us != Some((exposure_us, delay_us)) {
+            let (wanted, delay) = (Some(exposure_us), Some(delay_us));
+            let wanted = ViewfinderParams { exposure_us: wanted, delay_us: delay, ..Default::default() };
+            self.client.viewfinder(&wanted)?;
+            self.settings_us = Some((exposure_us, delay_us));
+        }
+        self.picture()
+    }
+
+    /// The next picture, of the settings asked for.
+    fn picture(&mut self) -> Result<ViewfinderValues, CommandFailure> {
         let began = Instant::now();
         loop {
             if self.interrupts.pending() {
@@ -252,7 +305,8 @@ impl Trial {
             }
             match self.events.next_within(Duration::from_millis(100))? {
                 Some(Event::Viewfinder(values)) => {
-                    let is_wanted = exposure_us.is_none_or(|us| values.exposure_us == us);
+                    let settings_us = (values.exposure_us, values.delay_us);
+                    let is_wanted = self.settings_us.is_none_or(|wanted_us| settings_us == wanted_us);
                     if let Some(problem) = values.problem {
                         return Err(CommandFailure::Exposure(problem));
                     }
@@ -346,7 +400,7 @@ impl Proposed {
         }
         if *headroom > WORTHWHILE {
             head.push(format!(
-                "the scene may be {headroom:.2} times as bright: open the aperture, or raise the gain, by that, multiply camera.white_dn by it, and try again"
+                "the scene may be {headroom:.2} times as bright, as long as a white board has at most 65 % of full scale, which a calibration needs: open the aperture, or raise the gain, calibrate, and try again"
             ));
         }
         if let Some(average) = average {
@@ -400,6 +454,7 @@ mod tests {
             sequence: None,
             picture: FinderPicture::White,
             exposure_us: 1.0,
+            delay_us: 0.0,
             region: [0, 100, 0, 200],
             black_dn: 64.0,
             saturation_dn: 3964.0,

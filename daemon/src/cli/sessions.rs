@@ -12,7 +12,7 @@ use raysweep_processing::ProcessError;
 use raysweep_processing::calibration::CalibrationHeader;
 use raysweep_proto::{RunParams, SessionInfo};
 use raysweep_session::Session;
-use raysweep_session::integrity::damaged_files;
+use raysweep_session::integrity::{Damage, DamagedPart, damaged_files};
 use raysweep_session::ledger::{EndState, Remark, State};
 use raysweep_session::report::{Picture, ToneMap};
 use serde::Serialize;
@@ -210,7 +210,9 @@ impl SessionView {
         rows.push(("frames", format!("{averaged} used of {expected}, {}", self.counts.losses())));
         rows.extend(self.light_s.map(|light_s| ("light", duration(light_s))));
         let calibration = self.calibration.map(|made| made.strftime("%Y-%m-%d %H:%M UTC").to_string());
-        rows.extend(calibration.map(|made| ("calibrated", made)));
+        let is_calibrated = ["sweep", "film", "patterns"].contains(&self.kind.as_str());
+        let without = is_calibrated.then(|| "no: times and levels are those of the rig file".into());
+        rows.extend(calibration.or(without).map(|made| ("calibrated", made)));
         let settings = self.settings.iter().filter(|(key, _)| !["kind", "name"].contains(&key.as_str()));
         let mut title = "settings";
         for (key, value) in settings {
@@ -445,8 +447,19 @@ pub(super) fn write_picture_of_difference(
 /// The plan of a session and what is known of it, for the same run again.
 pub(super) fn run_again(dir: &Path) -> Result<RunParams, CommandFailure> {
     let session = Session::open(dir).map_err(ProcessError::from)?;
-    let entry = session.state().map_err(ProcessError::from)?.session;
-    let plan = session.read_text(&session.plan_path()).map_err(ProcessError::from)?;
+    let state = session.state().map_err(ProcessError::from)?;
+    let plan = session.plan_path();
+    let of_plan = ["plan.toml".to_owned()];
+    let damaged = damaged_files(&session, &state, &of_plan).map_err(ProcessError::from)?;
+    // Light would be turned on for what nobody has planned.
+    let is_of_plan =
+        |damage: &&Damage| matches!(&damage.part, DamagedPart::Input { file } if of_plan.contains(file));
+    if let Some(damage) = damaged.iter().find(is_of_plan) {
+        let advice = format!("if it is what you want, `raysweep run {}`", plan.display());
+        return Err(CommandFailure::Sessions(format!("{}: {damage}; {advice}", session.dir().display())));
+    }
+    let plan = session.read_text(&plan).map_err(ProcessError::from)?;
+    let entry = state.session;
     Ok(RunParams {
         plan,
         operator: entry.operator,

@@ -439,9 +439,7 @@ pub(super) fn audit(audit: &Audit, stored: usize, points: usize) -> String {
             .push("the last line of ledger.jsonl was torn by a crash: what it recorded is not stored".into());
     }
     if !has_manifest {
-        lines.push(
-            "there is no manifest, because the session is not complete: its results were not checked".into(),
-        );
+        lines.push("there is no manifest: what results there are were not checked".into());
     }
     lines.extend(added.iter().map(|file| format!("{file} is not in the manifest, so it was not checked")));
     lines.push(match damage.len() {

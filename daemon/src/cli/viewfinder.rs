@@ -46,7 +46,7 @@ pub(super) fn change_or_plan(
             let message = "a viewfinder runs, and --board, --seconds and --trigger are for one that begins: end it with `raysweep cancel` first";
             return Err(ClientError::Rpc(RpcError::new(ErrorCode::Busy, message)).into());
         }
-        client.viewfinder(&ViewfinderParams { picture, region, exposure_us })?;
+        client.viewfinder(&ViewfinderParams { picture, region, exposure_us, delay_us: None })?;
         return Ok(Wanted::Changed);
     }
     match &arguments.plan {

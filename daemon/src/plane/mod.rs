@@ -69,6 +69,11 @@ impl LitProjector {
         Ok(Self { projector, operator })
     }
 
+    /// Whether a person operates it.
+    pub fn is_operated(&self) -> bool {
+        self.operator.is_some()
+    }
+
     /// Shows a pattern, or nothing; `None` if the run was ended while waiting for the operator.
     ///
     /// # Errors
@@ -299,7 +304,7 @@ impl Passes<'_> {
     /// A person who works the projector is not asked for it.
     fn look_for_light(&mut self) -> Result<(), RunError> {
         let regular = self.task.schedule.points.iter().find(|point| point.role == PointRole::Regular);
-        let Some(regular) = regular.copied().filter(|_| self.projector.operator.is_none()) else {
+        let Some(regular) = regular.copied().filter(|_| !self.projector.is_operated()) else {
             return Ok(());
         };
         let Some(dark) = self.glance(None, &regular)? else { return Ok(()) };

@@ -30,10 +30,11 @@ impl WantedLook {
     pub fn change(&self, wanted: &ViewfinderParams) -> Result<(), NoViewfinder> {
         let mut look = self.lock();
         let waiting = look.as_mut().ok_or(NoViewfinder)?;
-        let ViewfinderParams { picture, region, exposure_us } = wanted;
+        let ViewfinderParams { picture, region, exposure_us, delay_us } = wanted;
         waiting.picture = picture.or(waiting.picture);
         waiting.region = region.or(waiting.region);
         waiting.exposure_us = exposure_us.or(waiting.exposure_us);
+        waiting.delay_us = delay_us.or(waiting.delay_us);
         Ok(())
     }
 
@@ -71,6 +72,10 @@ pub fn check_look(
             "region = {region:?}: give [first row, row after the last, first column, column after the last] within {rows} rows and {columns} columns"
         );
         return invalid("region", what);
+    }
+    if let Some(delay_us) = wanted.delay_us.filter(|delay_us| is_dot_rig || !delay_us.is_finite()) {
+        let allowed = if is_dot_rig { "a dot rig has no delays: leave it out" } else { "give a number" };
+        return invalid("delay_us", format!("delay_us = {delay_us}: {allowed}"));
     }
     let allowed = &camera.exposure_us;
     match wanted.exposure_us.filter(|exposure_us| !allowed.contains(exposure_us)) {

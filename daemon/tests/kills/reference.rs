@@ -198,7 +198,7 @@ impl<'a> Reference<'a> {
             verdict.lost.push("lines that were in the ledger before the kill".into());
         }
         if verdict.read(&session) {
-            verdict.verify(&session);
+            verdict.verify_killed(&session);
             let before = stored(&session);
             match self.kind.is_resumable {
                 true => self.judge_resumed(&mut verdict, &session, &before),

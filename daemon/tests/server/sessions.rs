@@ -262,6 +262,18 @@ fn a_session_is_run_again_with_its_plan_and_what_was_known_of_it() {
     );
     // The fake has no session that it could be compared with.
     assert!(String::from_utf8(output.stderr).unwrap().contains("what has changed since is not known"));
+    drop(runs);
+    done(&["process", text(&session)]);
+    let plan = fs::read_to_string(session.join("plan.toml")).unwrap();
+    fs::write(session.join("plan.toml"), plan + "# changed\n").unwrap();
+    let output = Command::new(env!("CARGO_BIN_EXE_raysweep"))
+        .env("RAYSWEEP_SOCKET", &daemon.path)
+        .args(["rerun", text(&session), "--detach"])
+        .output()
+        .unwrap();
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(!output.status.success() && said.contains("plan.toml is damaged"), "{said}");
+    assert_eq!(daemon.fake.runs.lock().unwrap().len(), 1, "nothing is run");
 }
 
 /// A processed session of its own.

@@ -69,10 +69,10 @@ impl FinderTask {
         self.task.schedule.points[0].exposure_us
     }
 
-    /// Camera settings for an exposure centred on the light of each camera row's own projector row. Without the trigger,
-    /// the exposure begins wherever it does.
-    pub fn settings(&self, exposure_us: f64, camera: &CameraCapabilities) -> CameraSettings {
-        let point = Point { exposure_us, ..self.task.schedule.points[0] };
+    /// Camera settings for an exposure centred on the light of each camera row's own projector row, but for this delay.
+    /// Without the trigger, the exposure begins wherever it does.
+    pub fn settings(&self, exposure_us: f64, delay_us: f64, camera: &CameraCapabilities) -> CameraSettings {
+        let point = Point { exposure_us, delay_us, ..self.task.schedule.points[0] };
         let settings = self.task.geometry.shot(&point, camera.trigger_latency_us).settings;
         match self.plan.trigger {
             FinderTrigger::Vsync => settings,

@@ -179,4 +179,10 @@ fn a_damaged_image_is_an_error() {
         fs::write(&path, damaged).unwrap();
         assert!(matches!(products.read_image("epipolar"), Err(Error::Codec { .. })));
     }
+    // A header that claims far more than there is.
+    let huge = String::from_utf8_lossy(&bytes[..128]).replace("(2, 2), }         ", "(1000000, 1000000), }");
+    assert!(huge.contains("1000000"), "{huge}");
+    let huge: Vec<u8> = [&bytes[..10], &huge.as_bytes()[huge.find('{').unwrap()..], &bytes[128..]].concat();
+    fs::write(&path, huge).unwrap();
+    assert!(matches!(products.read_image("epipolar"), Err(Error::Codec { .. })));
 }

@@ -27,7 +27,7 @@ pub fn report(plan: &ViewfinderPlan, lab: &Lab<'_>) -> CheckReport {
 /// # Errors
 /// For what the camera cannot do, or a region outside of its frames.
 pub fn plane(plan: &Plan, task: &FinderTask, lab: &Lab<'_>) -> Result<(), ConfigError> {
-    let settings = task.settings(task.exposure_us(), lab.camera);
+    let settings = task.settings(task.exposure_us(), 0.0, lab.camera);
     lab.camera.allows(&settings).map_err(|message| {
         plan.places.error(&["viewfinder", "exposure_us"], format!("viewfinder.{message}"))
     })?;

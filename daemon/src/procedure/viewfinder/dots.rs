@@ -11,6 +11,7 @@ use raysweep_pipeline::dots::Arrival;
 use raysweep_processing::viewfinder::{CountScale, EXPOSED_SHARE, saturation_dn};
 use raysweep_proto::RunState;
 
+use super::LitTime;
 use super::finder::{Finder, FinderRig};
 use crate::devices::dots::FRAMES_AT_WORK;
 use crate::devices::dots::camera::FrameRefused;
@@ -49,7 +50,7 @@ pub fn settings(rig: &DotRig, plan: &ViewfinderPlan) -> CameraSettings {
 ///
 /// # Errors
 /// When a device fails, or light is not permitted.
-pub fn view(rig: &DotRig, plan: &ViewfinderPlan, run: &Run) -> Result<(), RunError> {
+pub fn view(rig: &DotRig, plan: &ViewfinderPlan, run: &Run, lit: &mut LitTime) -> Result<(), RunError> {
     let opened = rig.open(&run.data, plan.camera_rate_hz)?;
     let DotDevices { mut camera, mirror, stand, clock, pace, .. } = run.probes.instead_of_dots(opened);
     let mut motion = Motion::new(mirror);
@@ -75,7 +76,7 @@ pub fn view(rig: &DotRig, plan: &ViewfinderPlan, run: &Run) -> Result<(), RunErr
         clock,
         pace,
     };
-    let viewed = watch(&mut player, &mut finder, rig, plan, &mut settings);
+    let viewed = watch(&mut player, &mut finder, rig, plan, &mut settings, lit);
     let _ = run.board.go(RunState::Draining);
     // Turn the light off before anything else ends.
     drop(motion);
@@ -92,6 +93,7 @@ fn watch(
     rig: &DotRig,
     plan: &ViewfinderPlan,
     settings: &mut CameraSettings,
+    lit: &mut LitTime,
 ) -> Result<(), RunError> {
     let (orders, pace) = (player.orders, player.pace);
     let mut writes = 0;
@@ -108,7 +110,7 @@ fn watch(
             match player.camera.configure(SettingsId { point: 0, attempt: writes }, &wanted) {
                 Ok(_) => {
                     *settings = wanted;
-                    finder.expose(exposure_us);
+                    finder.expose(exposure_us, 0.0);
                 }
                 Err(error) if error.kind == DeviceErrorKind::OutOfRange => finder.complain(error.to_string()),
                 Err(error) => return Err(error.into()),
@@ -117,7 +119,8 @@ fn watch(
         let path = path(rig, plan, finder.picture()).map_err(|error| RunError::Frame(error.to_string()))?;
         let enough = AtomicBool::new(false);
         let mut failed = None;
-        player.play(&path, ROUNDS, u64::MAX, &enough, &mut |arrival: Arrival| {
+        lit.note(path.is_lit());
+        let played = player.play(&path, ROUNDS, u64::MAX, &enough, &mut |arrival: Arrival| {
             let is_enough = finder.is_over() || orders.look.is_changed() || orders.now() != Order::Go;
             enough.fetch_or(is_enough, Ordering::Relaxed);
             if is_enough || (pace == Pace::Devices && !finder.time_to_next().is_zero()) {
@@ -132,7 +135,9 @@ fn watch(
                 orders.rest(finder.time_to_next());
             }
             Ok(())
-        })?;
+        });
+        lit.note(false);
+        played?;
         if let Some(error) = failed {
             return Err(error);
         }

@@ -80,6 +80,7 @@ impl Finder {
                 sequence: None,
                 picture: plan.picture,
                 exposure_us,
+                delay_us: 0.0,
                 region: plan.region.unwrap_or([0, rows, 0, columns]),
                 black_dn: scale.black_dn,
                 saturation_dn: scale.saturation_dn,
@@ -126,12 +127,17 @@ impl Finder {
         self.values.exposure_us
     }
 
-    /// Notes the exposure of the frames from now on.
-    pub fn expose(&mut self, exposure_us: f64) {
-        self.values.exposure_us = exposure_us;
+    /// Delay of the frames' exposures.
+    pub fn delay_us(&self) -> f64 {
+        self.values.delay_us
     }
 
-    /// Takes over what clients have changed, but for the exposure, which the camera may refuse.
+    /// Notes exposure and delay of the frames from now on.
+    pub fn expose(&mut self, exposure_us: f64, delay_us: f64) {
+        (self.values.exposure_us, self.values.delay_us) = (exposure_us, delay_us);
+    }
+
+    /// Takes over what clients have changed, but for exposure and delay, which the camera may refuse.
     pub fn change(&mut self, wanted: &ViewfinderParams) {
         let values = &mut self.values;
         values.picture = wanted.picture.unwrap_or(values.picture);
@@ -238,6 +244,7 @@ impl Finder {
             ("size", json!(pixels.shape())),
             ("pictures", json!(self.values.pictures)),
             ("exposure_us", json!(self.values.exposure_us)),
+            ("delay_us", json!(self.values.delay_us)),
             ("black_dn", json!(self.scale.black_dn)),
             ("saturation_dn", json!(self.scale.saturation_dn)),
             ("underexposed_dn", json!(self.scale.underexposed_dn())),

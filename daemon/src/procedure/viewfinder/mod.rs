@@ -7,7 +7,7 @@ mod finder;
 mod plane;
 
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use raysweep_config::plan::ViewfinderPlan;
 use raysweep_config::{ConfigError, Plan};
@@ -73,6 +73,21 @@ fn foreseen(lab: &Lab<'_>, plan: &Plan, first_row: usize, run: FinderRun) -> For
     }
 }
 
+/// How long there was light.
+#[derive(Default)]
+struct LitTime {
+    before: Duration,
+    since: Option<Instant>,
+}
+
+impl LitTime {
+    /// Notes that there is light from now on, or none.
+    fn note(&mut self, is_lit: bool) {
+        self.before += self.since.take().map_or(Duration::ZERO, |since| since.elapsed());
+        self.since = is_lit.then(Instant::now);
+    }
+}
+
 impl Measurement for FinderRun {
     fn measure(self: Box<Self>, mut run: Run) -> Result<Ended, RunError> {
         run.note_beginning()?;
@@ -80,15 +95,16 @@ impl Measurement for FinderRun {
         if let Some(Err(error)) = run.live.as_ref().map(|outlet| outlet.file.clear()) {
             tracing::warn!(%error, "the live file still shows the run before");
         }
-        let began = Instant::now();
+        let mut lit = LitTime::default();
         let viewed = match *self {
-            Self::Plane { rig, task } => plane::view(&rig, task, &run),
-            Self::Dots { rig, plan } => dots::view(&rig, &plan, &run),
+            Self::Plane { rig, task } => plane::view(&rig, task, &run, &mut lit),
+            Self::Dots { rig, plan } => dots::view(&rig, &plan, &run, &mut lit),
         };
+        lit.note(false);
         let error = viewed.err().map(|error| error.to_string());
         // It has no end of its own: whoever cancels it has seen enough.
         let state = if error.is_some() { EndState::Faulted } else { EndState::Complete };
-        let light_s = Some(began.elapsed().as_secs_f64());
+        let light_s = Some(lit.before.as_secs_f64());
         let end = EndEntry { error, light_s, ..EndEntry::new(state, 0, 0, run.warnings) };
         run.ledger.append(&Entry::End(end.clone()))?;
         Ok(Ended { end, found: Vec::new() })

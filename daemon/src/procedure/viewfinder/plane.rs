@@ -10,6 +10,7 @@ use raysweep_core::{
 use raysweep_processing::viewfinder::{AlignPictures, CountScale, FinderTask, SeenRows, pattern_of};
 use raysweep_proto::{RowAlignment, RunState, ViewfinderParams};
 
+use super::LitTime;
 use super::finder::{Finder, FinderRig};
 use crate::devices::operator;
 use crate::plane::LitProjector;
@@ -30,7 +31,7 @@ const NO_FRAMES: &str = "no frame for 2 s, though the camera should run freely; 
 ///
 /// # Errors
 /// When a device fails.
-pub fn view(rig: &Rig, task: FinderTask, run: &Run) -> Result<(), RunError> {
+pub fn view(rig: &Rig, task: FinderTask, run: &Run, lit: &mut LitTime) -> Result<(), RunError> {
     let free_hz = task.free_hz();
     let opened = free_hz.map_or_else(|| rig.open(), |free_hz| rig.open_free_running(free_hz))?;
     let Devices { camera, vsync, projector, questions, stand, pace, .. } = run.probes.instead_of(opened);
@@ -66,6 +67,7 @@ pub fn view(rig: &Rig, task: FinderTask, run: &Run) -> Result<(), RunError> {
         writes: 0,
         shown_ns: i64::MIN,
         first_seq: 0,
+        lit,
     };
     let _ = run.board.go(RunState::Armed);
     let _ = run.board.go(RunState::Running);
@@ -98,11 +100,12 @@ struct Viewer<'a> {
     shown_ns: i64,
     /// Earlier frames may have the settings before.
     first_seq: u64,
+    lit: &'a mut LitTime,
 }
 
 impl Viewer<'_> {
     fn run(&mut self) -> Result<(), RunError> {
-        self.expose(self.finder.exposure_us())?;
+        self.expose(self.finder.exposure_us(), 0.0)?;
         self.camera.arm()?;
         self.light()?;
         let viewed = self.frames();
@@ -119,12 +122,16 @@ impl Viewer<'_> {
         };
         let mut waiting = Instant::now();
         while self.orders.go_on() && !self.finder.is_over() {
-            if self.orders.now() == Order::Pause {
-                self.orders.wait_while_paused_until(self.finder.ends());
+            let is_paused = self.orders.now() == Order::Pause;
+            // An operator who works the projector is asked only when the pause is over.
+            if !is_paused || !self.projector.is_operated() {
+                self.change()?;
+            }
+            if is_paused {
+                self.orders.wait_while_paused_until(Some(Instant::now() + POLL));
                 waiting = Instant::now();
                 continue;
             }
-            self.change()?;
             match self.camera.next_frame(&mut self.buffer, POLL)? {
                 Some(stamp) => {
                     waiting = Instant::now();
@@ -145,9 +152,10 @@ impl Viewer<'_> {
         }
         let wanted = self.orders.look.take();
         self.finder.change(&wanted);
-        let ViewfinderParams { picture, exposure_us, .. } = wanted;
-        if let Some(exposure_us) = exposure_us {
-            self.expose(exposure_us)?;
+        let ViewfinderParams { picture, exposure_us, delay_us, .. } = wanted;
+        if exposure_us.is_some() || delay_us.is_some() {
+            let exposure_us = exposure_us.unwrap_or(self.finder.exposure_us());
+            self.expose(exposure_us, delay_us.unwrap_or(self.finder.delay_us()))?;
         }
         if picture.is_some() {
             self.rows.restart();
@@ -156,14 +164,14 @@ impl Viewer<'_> {
         Ok(())
     }
 
-    /// Writes the exposure. One that the camera refuses leaves it as it was.
-    fn expose(&mut self, exposure_us: f64) -> Result<(), RunError> {
-        let settings = self.task.settings(exposure_us, &self.capabilities);
+    /// Writes exposure and delay. What the camera refuses leaves them as they were.
+    fn expose(&mut self, exposure_us: f64, delay_us: f64) -> Result<(), RunError> {
+        let settings = self.task.settings(exposure_us, delay_us, &self.capabilities);
         let applied = self.camera.configure(SettingsId { point: 0, attempt: self.writes }, &settings);
         self.writes += 1;
         match applied {
             Ok(applied) => {
-                self.finder.expose(exposure_us);
+                self.finder.expose(exposure_us, delay_us);
                 self.first_seq = applied.first_frame.certain();
             }
             Err(error) if error.kind == DeviceErrorKind::OutOfRange => {
@@ -184,7 +192,10 @@ impl Viewer<'_> {
             picture => pattern_of(picture),
         };
         match self.projector.show(pattern.as_ref(), self.orders) {
-            Ok(Some(shown)) => self.shown_ns = shown.not_before_ns,
+            Ok(Some(shown)) => {
+                self.shown_ns = shown.not_before_ns;
+                self.lit.note(pattern.is_some());
+            }
             // The run was ended while an operator was asked.
             Ok(None) => {}
             Err(error) if is_refused(&error) => {
@@ -201,6 +212,7 @@ impl Viewer<'_> {
         self.finder.change(&ViewfinderParams { picture: Some(FinderPicture::Black), ..Default::default() });
         if let Some(shown) = self.projector.show(None, self.orders)? {
             self.shown_ns = shown.not_before_ns;
+            self.lit.note(false);
         }
         self.finder.complain(why);
         Ok(())
