@@ -144,7 +144,8 @@ fn shown(kept: &KeptCalibration) -> String {
         let _ = writeln!(text, "{name:NAME_WIDTH$} {}", with_error(pair));
     }
     let [_, latency_sd] = rounded([0.0, header.timing.latency_sd_us]);
-    let _ = write!(text, "{:NAME_WIDTH$} known to {latency_sd} us", "latency");
+    let clocks = "with the clocks of camera and VSYNC watcher as they were tied then";
+    let _ = write!(text, "{:NAME_WIDTH$} known to {latency_sd} us, {clocks}", "latency");
     if let Some(dn) = header.light.saturation_dn {
         let _ = write!(text, "\n{:NAME_WIDTH$} {dn:.0}", "pixels saturate from / DN");
     }

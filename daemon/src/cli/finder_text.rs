@@ -25,7 +25,10 @@ pub(super) fn line(values: &ViewfinderValues) -> String {
         values.mean_dn, values.brightest_dn
     );
     if let Some(SeenDot { row, column, fwhm_px, peak_dn }) = &values.dot {
-        let _ = write!(line, "  dot at {row:.1}, {column:.1}, {fwhm_px:.1} px wide, peak {peak_dn:.0}");
+        let _ = write!(
+            line,
+            "  dot at row {row:.1}, column {column:.1}, {fwhm_px:.1} px wide, peak {peak_dn:.0}"
+        );
     }
     line
 }

@@ -4,7 +4,6 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use ndarray::{Axis, Ix3};
-use raysweep_processing::ProcessError;
 use raysweep_session::report::{Picture, ToneMap};
 use raysweep_session::{Session, input};
 use serde_json::{Value, json};
@@ -64,7 +63,8 @@ pub(super) fn small(session: &Session, name: &str) -> raysweep_session::Result<O
     Picture::small(image.view(), white).to_png().map(Some)
 }
 
-/// Writes a small PNG file of each picture of a session into `folder`; returns their paths.
+/// Writes a small PNG file of each picture of a session into `folder`; returns their paths. What cannot be read is left out:
+/// it is shown as damaged.
 pub(super) fn write(session: &Session, folder: &Path) -> Result<Vec<PathBuf>, CommandFailure> {
     let paths: Vec<(String, PathBuf)> = pictures(session)
         .into_iter()
@@ -75,7 +75,7 @@ pub(super) fn write(session: &Session, folder: &Path) -> Result<Vec<PathBuf>, Co
     fs::create_dir_all(folder).map_err(|source| CommandFailure::Write { path: folder.to_owned(), source })?;
     let mut written = Vec::new();
     for (name, path) in paths {
-        let Some(png) = small(session, &name).map_err(ProcessError::from)? else { continue };
+        let Ok(Some(png)) = small(session, &name) else { continue };
         picture_file::write(&path, &png)?;
         written.push(path);
     }

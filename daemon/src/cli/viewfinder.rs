@@ -40,14 +40,21 @@ pub(super) fn change_or_plan(
     let mut client = Client::connect(socket)?;
     let status = client.status()?;
     let is_over = matches!(status.state, RunState::Idle | RunState::Faulted);
-    if let (false, Some(_), None) = (is_over, &status.viewfinder, &arguments.plan) {
+    if let (false, None) = (is_over, &arguments.plan) {
         let ViewfinderArguments { picture, trigger, region, exposure_us, board, seconds, .. } = *arguments;
-        if board || seconds.is_some() || trigger.is_some() {
+        let is_of_another = board || seconds.is_some() || trigger.is_some();
+        if is_of_another && status.viewfinder.is_some() {
             let message = "a viewfinder runs, and --board, --seconds and --trigger are for one that begins: end it with `raysweep cancel` first";
             return Err(ClientError::Rpc(RpcError::new(ErrorCode::Busy, message)).into());
         }
-        client.viewfinder(&ViewfinderParams { picture, region, exposure_us, delay_us: None })?;
-        return Ok(Wanted::Changed);
+        // One that has not shown anything yet is not in the status.
+        let wanted = ViewfinderParams { picture, region, exposure_us, delay_us: None };
+        match (!is_of_another).then(|| client.viewfinder(&wanted)) {
+            None => {}
+            Some(Ok(())) => return Ok(Wanted::Changed),
+            Some(Err(ClientError::Rpc(error))) if error.name() == Some(ErrorCode::NotRunning) => {}
+            Some(Err(error)) => return Err(error.into()),
+        }
     }
     match &arguments.plan {
         Some(path) => Ok(Wanted::Plan(path.clone(), read_plan(path)?)),

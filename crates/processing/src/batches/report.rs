@@ -118,7 +118,9 @@ fn planes(calibration: &Calibration, task: &DotTask) -> Section {
         ),
         Err(sd_px) => (
             "dots beside the plane",
-            format!("not placed: the dots lie {sd_px:.1} px from where the mirror's path would have them"),
+            format!(
+                "not placed: the dots lie {sd_px:.1} px from where the mirror's path would have them, as behind a mirror that lags; a plan of kind \"response\" identifies it, so that later paths allow for that"
+            ),
         ),
     });
     entries.push(match &calibration.epipolar {

@@ -50,6 +50,15 @@ pub fn setup(files: &SetupFiles<'_>, printer: Printer) -> Result<Exit, CommandFa
     let SetupFiles { answers, rig, plan, force } = *files;
     // Before anything is asked: answers should not be lost.
     may_write([rig, plan], force)?;
+    let is_replaced = |answers: &&Path| {
+        let itself = fs::canonicalize(answers).ok();
+        itself.is_some() && [rig, plan].into_iter().any(|path| fs::canonicalize(path).ok() == itself)
+    };
+    if let Some(answers) = answers.filter(is_replaced) {
+        let message =
+            format!("{}: it has the answers, and is not replaced: give another name", answers.display());
+        return Err(CommandFailure::Setup(message));
+    }
     let mut questions = Questions::of(answers)?;
     let mut connected = ConnectedDevices::search();
     let is_spoken = !printer.json;
