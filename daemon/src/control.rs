@@ -43,7 +43,7 @@ pub trait Control: Send + Sync + 'static {
     /// `Busy`, `NoSession`, `Device`, `Storage`.
     fn resume(&self, params: ResumeParams) -> Result<Started, RpcError>;
 
-    /// Pauses the run before its next point.
+    /// Pauses the run before its next point, or at once where a mirror moves, which is parked.
     ///
     /// # Errors
     /// `NotRunning`.

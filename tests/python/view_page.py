@@ -192,6 +192,8 @@ def visit(page, name):
     expect(page.locator("#session .u-wrap")).to_be_visible()
     page.locator("#sessions li", has_text="groove").nth(1).get_by_role("button", name="compare").click()
     expect(page.locator("#session h3").nth(2)).to_contain_text("RMS")
+    expect(page.locator("#session .differences th")).to_have_count(3)
+    expect(page.locator("#session .differences tr", has_text="kind")).to_have_count(0)
     expect(page.locator("#session canvas.image")).to_have_count(3)
     page.locator("#session canvas.image").first.focus()
     page.keyboard.press("ArrowDown")

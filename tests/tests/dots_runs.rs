@@ -354,7 +354,7 @@ fn a_pause_parks_the_mirror_at_once_and_costs_no_batch() {
     for (frame, expected) in [(10, 0), (700, 1), (1190, 2), (2 * 1200 + 800, 5)] {
         let (bench, asked) = trapped(&rig(""), frame, |runner| runner.pause().unwrap());
         let mut events = bench.runner.events();
-        let plan = plan(FLOODLIT, 2);
+        let plan = plan(FLOODLIT, 2).replace("dark_frames = 64", "dark_frames = 64\nkeep_raw = true");
         bench.runner.run(RunParams { plan, ..RunParams::default() }).unwrap();
         wait_until(|| bench.runner.status().state == RunState::Paused && *asked.lock().unwrap() == "park");
         // Enough time for a run that does not pause to acquire the rest.
@@ -378,6 +378,25 @@ fn a_pause_parks_the_mirror_at_once_and_costs_no_batch() {
         let (of_held, of_through) = (held.open().1.counts, through.open().1.counts);
         assert!(of_held.balanced(), "{of_held:?}");
         assert_eq!((of_held.lost_total(), of_held.averaged), (0, of_through.averaged));
+        let raw = held.open().0.raw_path();
+        let frames: Array3<u16> = ndarray_npy::read_npy(&raw).unwrap();
+        let lines = std::fs::read_to_string(raw.with_extension("csv")).unwrap();
+        assert_eq!(lines.lines().count(), 1 + frames.dim().0, "at frame {frame}: each frame has one line");
+    }
+}
+
+#[test]
+fn no_path_begins_in_a_pause() {
+    for _ in 0..5 {
+        let (bench, asked) = trapped(&rig(""), usize::MAX, |_| {});
+        let mut events = bench.runner.events();
+        bench.runner.run(RunParams { plan: plan(FLOODLIT, 2), ..RunParams::default() }).unwrap();
+        wait_until(|| bench.runner.pause().is_ok());
+        std::thread::sleep(Duration::from_millis(200));
+        assert_eq!(bench.runner.status().state, RunState::Paused);
+        assert_ne!(*asked.lock().unwrap(), "start", "the mirror plays");
+        bench.runner.go_on().unwrap();
+        assert_eq!(end_of(&mut events).state, "complete");
     }
 }
 

@@ -9,9 +9,9 @@ use raysweep_transport::plane::{RowTiming, Setting};
 const NEAR_US: f64 = 2.0;
 /// Standard errors within which a latency may be off by chance.
 const DOUBT: f64 = 2.0;
-/// One that is off by more standard errors is adopted however uncertain it is.
+/// One that is off by more standard errors is adopted however uncertain it is: what it corrects is larger.
 const BEYOND_DOUBT: f64 = 5.0;
-/// One less certain than this is adopted only if the calibration's own is less certain still.
+/// One less certain than this is adopted only if the calibration's own is less certain still, or [`BEYOND_DOUBT`].
 const CERTAIN_US: f64 = 0.5;
 /// Direct light further from its place causes a warning.
 const NEAR_ROWS: f64 = 0.1;

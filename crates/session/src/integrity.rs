@@ -104,10 +104,7 @@ impl Audit {
                     (lines_are_sound && !begins_with(path, record)?).then(|| SHORTENED.into())
                 }
                 _ if state.files().contains_key(file) || is_data(file) => None,
-                Some(path) => match std::fs::symlink_metadata(path) {
-                    Ok(found) if found.is_file() && found.len() != record.bytes => Some(OTHER_SIZE.into()),
-                    _ => why_unlike(path, &record.sha256, NOT_OF_MANIFEST)?,
-                },
+                Some(path) => why_unlike_manifest(path, record)?,
                 None => Some(MISSING.into()),
             };
             let file = file.clone();
@@ -126,6 +123,7 @@ impl Audit {
 const LEDGER: &str = "ledger.jsonl";
 const MANIFEST: &str = "manifest.json";
 const MISSING: &str = "it is missing";
+const NO_MANIFEST: &str = "it is missing, unless the run is being finished at this moment";
 const NOT_OF_LEDGER: &str = "its SHA-256 is not the one in the ledger";
 const NOT_OF_MANIFEST: &str = "its SHA-256 is not the one in the manifest";
 const SHORTENED: &str = "it does not begin with the lines that it had when the manifest was written";
@@ -137,7 +135,7 @@ fn missing_manifest(state: &State) -> Option<Damage> {
     let is_complete = state.end.as_ref().is_some_and(|end| end.state == EndState::Complete);
     let part = DamagedPart::Result { file: MANIFEST.into() };
     (is_complete && state.session.shape.contents != Contents::Nothing)
-        .then(|| Damage { part, why: MISSING.into() })
+        .then(|| Damage { part, why: NO_MANIFEST.into() })
 }
 
 /// Whether the CRC-32 of a file's content is in the ledger.
@@ -172,13 +170,7 @@ fn begins_with(path: &Path, record: &FileRecord) -> Result<bool> {
 pub fn changed_inputs(session: &Session, state: &State) -> Result<Vec<Damage>> {
     let mut changed = Vec::new();
     for (file, sha256) in state.files() {
-        let path = session.dir().join(file);
-        // What no plan or rig file can be need not be read to its end.
-        let is_text = file.ends_with(".toml");
-        let why = match std::fs::symlink_metadata(&path) {
-            Ok(found) if is_text && found.len() > MOST_TEXT_BYTES => Some(NOT_OF_LEDGER.into()),
-            _ => why_unlike(&path, sha256, NOT_OF_LEDGER)?,
-        };
+        let why = why_unlike_ledger(&session.dir().join(file), sha256)?;
         let part = DamagedPart::Input { file: file.clone() };
         changed.extend(why.map(|why| Damage { part, why }));
     }
@@ -206,8 +198,8 @@ pub fn damaged_files(session: &Session, state: &State, files: &[String]) -> Resu
     for file in files {
         let path = session.dir().join(file);
         let why = match (state.files().get(file), recorded.get(file)) {
-            (Some(sha256), _) => why_unlike(&path, sha256, NOT_OF_LEDGER)?,
-            (None, Some(record)) => why_unlike(&path, &record.sha256, NOT_OF_MANIFEST)?,
+            (Some(sha256), _) => why_unlike_ledger(&path, sha256)?,
+            (None, Some(record)) => why_unlike_manifest(&path, record)?,
             (None, None) => None,
         };
         let file = file.clone();
@@ -218,6 +210,24 @@ pub fn damaged_files(session: &Session, state: &State, files: &[String]) -> Resu
         damage.extend(why.map(|why| Damage { part, why }));
     }
     Ok(damage)
+}
+
+/// Why a file is not the one that the ledger has, if it is another.
+fn why_unlike_ledger(path: &Path, sha256: &str) -> Result<Option<String>> {
+    // What no plan or rig file can be need not be read to its end.
+    let is_text = path.extension().is_some_and(|ending| ending == "toml");
+    match std::fs::symlink_metadata(path) {
+        Ok(found) if is_text && found.len() > MOST_TEXT_BYTES => Ok(Some(NOT_OF_LEDGER.into())),
+        _ => why_unlike(path, sha256, NOT_OF_LEDGER),
+    }
+}
+
+/// Why a file is not the one that the manifest has, if it is another.
+fn why_unlike_manifest(path: &Path, record: &FileRecord) -> Result<Option<String>> {
+    match std::fs::symlink_metadata(path) {
+        Ok(found) if found.is_file() && found.len() != record.bytes => Ok(Some(OTHER_SIZE.into())),
+        _ => why_unlike(path, &record.sha256, NOT_OF_MANIFEST),
+    }
 }
 
 /// Why a file is not the one that has this SHA-256, if it is another, is missing, or is no file at all.

@@ -152,7 +152,7 @@ pub enum Command {
         #[arg(long, value_name = "PORT", default_value_t = 0, hide_default_value = true)]
         port: u16,
     },
-    /// Pause the run before its next point
+    /// Pause the run before its next point, or with its mirror parked at once
     Pause,
     /// Continue a paused run
     Continue,

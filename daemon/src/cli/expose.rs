@@ -36,7 +36,7 @@ const MAX_AVERAGE: f64 = 64.0;
 const PATIENCE: Duration = Duration::from_secs(10);
 /// The viewfinder ends after this time even if nobody can end it any more.
 const VIEWFINDER: &str =
-    "kind = \"viewfinder\"\nname = \"expose\"\n[viewfinder]\npictures_per_s = 30\nseconds = 120\n";
+    "kind = \"viewfinder\"\nname = \"expose\"\n[viewfinder]\npictures_per_s = 30\nseconds = 1200\n";
 
 /// Tries exposures for a plan, and prints what it proposes.
 pub(super) fn expose(socket: &Path, path: &Path, printer: Printer) -> Result<Exit, CommandFailure> {
@@ -72,14 +72,17 @@ pub(super) fn expose(socket: &Path, path: &Path, printer: Printer) -> Result<Exi
 
 /// The delays of a plan.
 fn delays(procedure: &Procedure) -> Vec<f64> {
-    match procedure {
+    let mut delays_us: Vec<f64> = match procedure {
         Procedure::Sweep(sweep) => {
             let extra = sweep.extra.iter().flat_map(|grid| grid.delay_us.values());
             sweep.delay_us.values().into_iter().chain(extra).collect()
         }
         Procedure::Film(film) => film.delay_us.values(),
         _ => Vec::new(),
-    }
+    };
+    delays_us.sort_by(f64::total_cmp);
+    delays_us.dedup();
+    delays_us
 }
 
 /// The shortest and the longest exposure of a plan.
@@ -228,7 +231,7 @@ impl Trial {
             let (_, delay_us) = brightest;
             let found = self.longest_at(delay_us, shortest_us, over_us)?;
             // Where another delay is the brightest in that exposure, it is tried again.
-            if found.exposure_us == over_us || found.exposure_us <= shortest_us {
+            if found.exposure_us == over_us {
                 return Ok(found);
             }
             over_us = found.exposure_us;

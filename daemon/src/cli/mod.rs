@@ -145,7 +145,7 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
         Command::Pause => {
             connect()?.pause()?;
             printer.print(&Empty {}, |_| {
-                "the run pauses before its next point; `raysweep continue` continues it".into()
+                "the run pauses before its next point, or with its mirror parked at once; `raysweep continue` continues it".into()
             })?;
         }
         Command::Continue => {

@@ -10,7 +10,7 @@ use super::look::WantedLook;
 pub enum Order {
     /// Acquire.
     Go,
-    /// Pause before the next point.
+    /// Pause before the next point, or at once where a mirror moves.
     Pause,
     /// End cleanly; what was acquired is kept.
     Cancel,
@@ -26,9 +26,15 @@ pub struct Orders {
     pub look: WantedLook,
 }
 
+/// One of the pauses of a run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Pause(u64);
+
 /// The order in force, and the pauses so far.
 struct Given {
     order: Order,
+    /// The newest pause.
+    pause: Pause,
     /// When the present pause began.
     paused_since: Option<Instant>,
     /// Length of the pauses that are over.
@@ -37,7 +43,8 @@ struct Given {
 
 impl Default for Orders {
     fn default() -> Self {
-        let given = Given { order: Order::Go, paused_since: None, paused: Duration::ZERO };
+        let (order, pause) = (Order::Go, Pause(0));
+        let given = Given { order, pause, paused_since: None, paused: Duration::ZERO };
         Self { given: Mutex::new(given), changed: Condvar::new(), look: WantedLook::default() }
     }
 }
@@ -65,8 +72,14 @@ impl Orders {
 
     /// Gives an order. The first order to end is final.
     pub fn give(&self, order: Order) {
-        let mut given = self.lock();
+        self.give_with(&mut self.lock(), order);
+    }
+
+    fn give_with(&self, given: &mut Given, order: Order) {
         if matches!(given.order, Order::Go | Order::Pause) {
+            if (given.order, order) == (Order::Go, Order::Pause) {
+                given.pause.0 += 1;
+            }
             given.order = order;
             if order == Order::Pause {
                 given.paused_since.get_or_insert_with(Instant::now);
@@ -75,6 +88,24 @@ impl Orders {
             }
             self.changed.notify_all();
         }
+    }
+
+    /// Pauses a run that goes on; `None` if it is paused already, or ends.
+    pub fn pause(&self) -> Option<Pause> {
+        let mut given = self.lock();
+        let goes_on = given.order == Order::Go;
+        self.give_with(&mut given, Order::Pause);
+        goes_on.then_some(given.pause)
+    }
+
+    /// Ends this pause, and no later one, if `goes_on` says that the run may go on; returns whether it does.
+    pub fn end_pause(&self, pause: Pause, goes_on: impl FnOnce() -> bool) -> bool {
+        let mut given = self.lock();
+        let ends = given.order == Order::Pause && given.pause == pause && goes_on();
+        if ends {
+            self.give_with(&mut given, Order::Go);
+        }
+        ends
     }
 
     /// Waits for `time`, unless the run ends.
@@ -137,6 +168,24 @@ mod tests {
             orders.give(Order::Go);
             waiting.join().unwrap();
         });
+    }
+
+    #[test]
+    fn a_pause_is_ended_by_whoever_began_it_and_no_other_is() {
+        let orders = Orders::default();
+        let first = orders.pause().unwrap();
+        assert_eq!(orders.pause(), None);
+        assert!(!orders.end_pause(first, || false));
+        assert_eq!(orders.now(), Order::Pause);
+        // Somebody continues, and pauses again.
+        orders.give(Order::Go);
+        orders.give(Order::Pause);
+        assert!(!orders.end_pause(first, || true));
+        assert_eq!(orders.now(), Order::Pause);
+        orders.give(Order::Go);
+        let second = orders.pause().unwrap();
+        assert!(orders.end_pause(second, || true));
+        assert_eq!(orders.now(), Order::Go);
     }
 
     #[test]

@@ -21,15 +21,15 @@ pub fn write_patiently<T>(
     board: &StatusBoard,
     mut write: impl FnMut() -> Result<T>,
 ) -> Result<T> {
-    // Whether the run is paused for the disk, and not because an operator paused it before.
-    let mut is_paused_here = false;
+    // The pause for the disk, if an operator has not paused the run before.
+    let mut own = None;
     let mut is_told = false;
     loop {
         let written = write();
         let Err(error) = &written else {
-            if is_paused_here && orders.now() == Order::Pause && board.go(RunState::Running).is_ok() {
+            // Under the orders' lock, so that no question asked meanwhile is taken for answered.
+            if own.is_some_and(|own| orders.end_pause(own, || board.go(RunState::Running).is_ok())) {
                 tracing::info!("the disk can be written again; the run goes on");
-                orders.give(Order::Go);
             }
             return written;
         };
@@ -47,8 +47,7 @@ pub fn write_patiently<T>(
             if !is_told {
                 return written;
             }
-            is_paused_here |= orders.now() == Order::Go;
-            orders.give(Order::Pause);
+            own = orders.pause().or(own);
         }
         orders.rest(RETRY);
     }
@@ -82,6 +81,36 @@ mod tests {
         })
         .unwrap();
         (asked.unwrap().text, orders.now())
+    }
+
+    #[test]
+    fn a_later_pause_for_an_operator_is_not_ended_by_the_disk() {
+        let (orders, board) = (Orders::default(), StatusBoard::new("plane"));
+        for state in [RunState::Preparing, RunState::Armed, RunState::Running] {
+            board.go(state).unwrap();
+        }
+        let mut tries = 0;
+        write_patiently(&orders, &board, || {
+            tries += 1;
+            match tries {
+                1 => Err(Error::Io { action: "write", path: "x".into(), source: Errno::ENOSPC.into() }),
+                _ => {
+                    // The operator has continued, and the run asks for something.
+                    orders.give(Order::Go);
+                    board.go(RunState::Running).unwrap();
+                    orders.give(Order::Pause);
+                    board.ask("put the plane there");
+                    Ok(())
+                }
+            }
+        })
+        .unwrap();
+        assert_eq!(orders.now(), Order::Pause);
+        let status = board.status();
+        assert_eq!(
+            (status.state, status.question.unwrap().text.as_str()),
+            (RunState::Paused, "put the plane there")
+        );
     }
 
     #[test]

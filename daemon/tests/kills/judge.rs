@@ -48,7 +48,7 @@ impl Verdict {
     /// The same after a kill, when the results of a run that has stored everything may still be missing.
     pub fn verify_killed(&mut self, session: &Path) {
         let verified = text(&raysweep(&["verify"], session));
-        let lacks_results_only = verified.contains("manifest.json is damaged (it is missing)")
+        let lacks_results_only = verified.contains("manifest.json is damaged (it is missing")
             && verified.contains("1 damaged: results alone");
         if !lacks_results_only {
             self.verify(session);

@@ -265,10 +265,12 @@ impl<S: CutSink> Gatherer<S> {
         }
         self.close();
         // Frames left undecided after an error count as not needed.
-        for waiting in self.pending.drain(..).flatten() {
+        for (arrival, waiting) in (self.first_pending..).zip(self.pending.drain(..)) {
+            let Some(waiting) = waiting else { continue };
             lose(&mut self.outside, &waiting.lost_before);
             self.outside.expected += 1;
             self.outside.cancelled += 1;
+            self.sink.fate(arrival, waiting.id, None);
         }
         self.sink.outside(std::mem::take(&mut self.outside));
         learnt

@@ -25,12 +25,21 @@ impl Motion {
         self.0.is_some()
     }
 
-    /// Moves the mirror to the path's first point and starts to play the path.
+    /// Moves the mirror to the path's first point and starts to play the path; parks it instead if `go_on` returns false.
+    /// Returns whether the path is played.
     ///
     /// # Errors
     /// An error of the mirror's driver, or a sample rate that would not match the frames.
-    pub fn start(&mut self, path: &MirrorPath, rounds: u32) -> Result<(), DeviceError> {
-        let Some(mirror) = &mut self.0 else { return Ok(()) };
+    pub fn start(
+        &mut self,
+        path: &MirrorPath,
+        rounds: u32,
+        go_on: &dyn Fn() -> bool,
+    ) -> Result<bool, DeviceError> {
+        let Some(mirror) = &mut self.0 else { return Ok(true) };
+        if !go_on() {
+            return Ok(false);
+        }
         let rate_hz = mirror.load(path)?;
         let wanted_hz = path.rate_hz();
         if (rate_hz - wanted_hz).abs() > RATE_TOLERANCE * wanted_hz {
@@ -39,7 +48,12 @@ impl Motion {
             );
             return Err(DeviceError::new("mirror", DeviceErrorKind::OutOfRange, what));
         }
-        mirror.start(rounds)
+        if !go_on() {
+            mirror.park()?;
+            return Ok(false);
+        }
+        mirror.start(rounds)?;
+        Ok(true)
     }
 
     /// Feeds the mirror until its path is over, or parks it as soon as `go_on` returns false.

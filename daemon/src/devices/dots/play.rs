@@ -69,7 +69,9 @@ impl Player<'_> {
         let is_driven = self.motion.is_driven();
         // Without a mirror, no path goes on after the frames, and the next frame of a recording is the next pass's.
         let (path_over, camera_over) = (AtomicBool::new(!is_driven), AtomicBool::new(false));
-        self.motion.start(path, rounds)?;
+        if !self.motion.start(path, rounds, &|| orders.now() == Order::Go)? {
+            return Ok(Played { lost: Vec::new(), is_held: orders.go_on() });
+        }
         let mut source = Source { camera: &mut *self.camera, pool: &self.pool, pace: self.pace };
         let (pace, is_simulated) = (self.pace, matches!(self.stand, Stand::Simulated(_)));
         let taken = AtomicU64::new(0);

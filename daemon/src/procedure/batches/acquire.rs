@@ -26,6 +26,7 @@ use crate::rig::{DotDevices, DotRig, Pace};
 use crate::run::error::RunError;
 use crate::run::life::Run;
 use crate::run::orders::Orders;
+use crate::run::patience::write_patiently;
 
 /// Most times that the path is played for the frames without light, if the camera loses some.
 const MOST_DARK_PASSES: u32 = 5;
@@ -146,7 +147,9 @@ impl DotPasses<'_> {
         let mut raw = match plan.keep_raw {
             true => {
                 let (rows, columns) = (self.task.shape.height(), self.task.shape.width());
-                let frames = RawFrames::create(&self.session.raw_path(), rows, columns)?;
+                let path = self.session.raw_path();
+                let create = || RawFrames::create(&path, rows, columns);
+                let frames = write_patiently(self.orders, self.player.board, create)?;
                 Some(self.storage.raw_sink(frames, self.task.format, self.task.shape.values()))
             }
             false => None,
@@ -197,7 +200,8 @@ impl DotPasses<'_> {
         };
         let sensor = dark.finish(hot_sigmas, field.as_ref(), task.sampling())?;
         if field.is_some() {
-            self.storage.note(flat::keep(self.session, &sensor.correction)?);
+            let keep = || flat::keep(self.session, &sensor.correction);
+            self.storage.note(write_patiently(self.orders, self.player.board, keep)?);
         }
         Ok(Some(sensor))
     }
@@ -239,7 +243,9 @@ impl DotPasses<'_> {
                     Ok(())
                 })?;
             frames += lost.iter().map(|loss| loss.frames).sum::<u64>();
-            self.orders.wait_while_paused();
+            if failed.is_none() {
+                self.orders.wait_while_paused();
+            }
             passes += u32::from(!is_held);
             // More frames would not help if as many as are wanted were of no use.
             let is_over = failed.is_some() || has_enough.load(Ordering::Relaxed) || arrived >= wanted;

@@ -180,7 +180,7 @@ impl Recorder {
                 })
             })?;
         let counts = arrivals.account(&lost, shown)?;
-        if is_held || !self.run.orders.go_on() {
+        if is_held && came < frames || !self.run.orders.go_on() {
             // A record that was cut short does not count.
             progress.under_way = None;
             let counts = Counts { cancelled: counts.cancelled + counts.averaged, averaged: 0, ..counts };
@@ -211,7 +211,9 @@ impl Recorder {
         counts: Counts,
         progress: &mut ProgressMeter,
     ) -> Result<(), RunError> {
-        self.record(entry)?;
+        if counts != Counts::default() || !matches!(entry, Entry::Outside { .. }) {
+            self.record(entry)?;
+        }
         progress.counts.add(&counts);
         self.run.board.publish(Event::Progress(progress.shown()));
         Ok(())

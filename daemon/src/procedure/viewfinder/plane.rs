@@ -152,7 +152,11 @@ impl Viewer<'_> {
         }
         let wanted = self.orders.look.take();
         self.finder.change(&wanted);
-        let ViewfinderParams { picture, exposure_us, delay_us, .. } = wanted;
+        let ViewfinderParams { picture, exposure_us, mut delay_us, .. } = wanted;
+        if delay_us.is_some() && self.task.free_hz().is_some() {
+            self.finder.complain("delay_us: a camera that runs freely has no delays");
+            delay_us = None;
+        }
         if exposure_us.is_some() || delay_us.is_some() {
             let exposure_us = exposure_us.unwrap_or(self.finder.exposure_us());
             self.expose(exposure_us, delay_us.unwrap_or(self.finder.delay_us()))?;

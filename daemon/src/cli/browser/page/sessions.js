@@ -98,7 +98,7 @@ export function startSessions({ watch }) {
           !two && one.can_resume ? resume(first, place) : null),
         ...[one, two].filter(Boolean).flatMap(({ session, damage, warnings }) => [...damage, ...warnings]
           .map((what) => note("warn", two ? `${nameOf(session)}: ${what}` : what))),
-        ...(two ? [] : [figures(one)]), sides, plot);
+        two ? differences(one, two) : figures(one), sides, plot);
       const pixel = profile(plot, [one, two].filter(Boolean));
       const draw = () => pictures(sides, [first, second], menu, pixel);
       menu.addEventListener("change", draw);
@@ -130,13 +130,27 @@ async function read(at) {
 }
 const about = (session) => read(address(session));
 
-function figures(session) {
-  const rows = [["kind", session.kind], ["begun", `${session.created.slice(0, 19).replace("T", " ")} UTC`],
+function rowsOf(session) {
+  return [["kind", session.kind], ["begun", `${session.created.slice(0, 19).replace("T", " ")} UTC`],
     ["state", session.state], ["stored", `${session.stored} of ${session.points}`], ["operator", session.operator],
     ["sample", session.sample], ["note", session.note], ["tags", session.tags.join(", ")], ["error", session.error],
     ...Object.entries(session.findings)];
-  return element("dl", { class: "figures" }, ...rows.filter(([, value]) => value)
+}
+
+function figures(session) {
+  return element("dl", { class: "figures" }, ...rowsOf(session).filter(([, value]) => value)
     .flatMap(([key, value]) => [element("dt", {}, key), element("dd", {}, value)]));
+}
+
+/** A table of what differs. */
+function differences(one, two) {
+  const sides = [one, two].map((session) => new Map([...rowsOf(session),
+    ["calibrated", session.calibration?.slice(0, 19).replace("T", " ")], ...Object.entries(session.settings)]));
+  const keys = [...new Set(sides.flatMap((side) => [...side.keys()]))]
+    .filter((key) => (sides[0].get(key) || "") !== (sides[1].get(key) || ""));
+  const row = (kind, cells) => element("tr", {}, ...cells.map((cell) => element(kind, {}, cell || "–")));
+  return element("table", { class: "differences" }, row("th", ["", nameOf(one.session), nameOf(two.session)]),
+    ...keys.map((key) => row("td", [key, ...sides.map((side) => side.get(key))])));
 }
 
 function joined(one, two) {
