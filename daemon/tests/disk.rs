@@ -220,13 +220,12 @@ fn batches_on_a_full_disk_are_held_and_none_is_lost() {
                 trailing_region = [112, 128, 48, 80]\nbackground_indices = [0]\n\
                 [batches.path]\nshape = \"lissajous\"\ncycles = [7, 1]\namplitude_deg = [2.3, 1.3]\nsamples = 1500\n\
                 rate_hz = 30000\n";
-    // A batch that cannot be named, the last, a line, raw frames, and their places.
+    // A batch that cannot be named, the last, a line, and raw frames.
     let cases = [
         ("dots.zarr/b0002.raysweep-tmp", "rename:error=ENOSPC:when=1"),
         ("dots.zarr/b0007.raysweep-tmp", "rename:error=ENOSPC:when=1..2"),
         ("ledger.jsonl", "fdatasync:error=ENOSPC:when=5"),
         ("raw.npy", "write:error=ENOSPC:when=1000"),
-        ("raw.csv", "write:error=ENOSPC:when=1"),
     ];
     std::thread::scope(|scope| {
         for (file, tamper) in cases {
