@@ -5,8 +5,8 @@ use std::process::Command;
 use crate::run::{Done, cargo, run, target};
 use crate::{binaries, guest, packages, python, rootfs, space};
 
-/// The most that all of this command has on the disk of the target folder, without incremental files. Where temporary files are on it too, they are
-/// gone before the guests' disks are made.
+/// The most that all of this command has on the disk of the target folder, without incremental files. Where temporary
+/// files are on it too, they are gone before the guests' disks are made.
 const TARGET_GIB: u64 = 11;
 /// What cargo's incremental files add, unless CARGO_INCREMENTAL forbids them.
 const INCREMENTAL_GIB: u64 = 3;

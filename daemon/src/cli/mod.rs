@@ -4,6 +4,7 @@ mod arguments;
 #[cfg(feature = "view")]
 mod browser;
 mod calibration;
+mod compare;
 mod devices;
 mod doctor;
 mod exit;
@@ -39,13 +40,14 @@ use raysweep_proto::{Client, DesignParams, Empty, RunParams, Started};
 use serde_json::json;
 
 use self::arguments::{Arguments, Command, RunArguments, RunDescription};
+use self::compare::{Compared, write_picture_of_difference};
 pub use self::doctor::text as doctor_text;
 use self::exit::Exit;
 use self::failure::CommandFailure;
 use self::follow::{Interrupts, OnInterrupt, follow};
 use self::plan_file::read_plan;
 use self::printer::{Printer, printable};
-use self::sessions::{Compared, SessionView, write_picture_of_difference};
+use self::sessions::SessionView;
 use self::setup::{SetupFiles, setup};
 use self::view::EventView;
 use self::viewfinder::{Wanted, change_or_plan, changed};
@@ -334,7 +336,7 @@ fn rerun(socket: &Path, printer: Printer, session: &Path, detach: bool) -> Resul
     begin_run(socket, printer, detach, interrupts_of(&params), |client| {
         let started =
             client.run(&params).map_err(|error| CommandFailure::of_plan(error, &plan, &params.plan))?;
-        let said = match sessions::changes(session, &started.session) {
+        let said = match compare::changes(session, &started.session) {
             Ok(changes) if changes.is_empty() => "nothing on the rig has changed since".into(),
             Ok(changes) => format!("changed since: {}", changes.join("\n               ")),
             // The run goes on all the same.

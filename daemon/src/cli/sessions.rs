@@ -1,12 +1,11 @@
-//! Finding, reading and keeping sessions: `sessions`, `show`, `diff`, `rerun`, `note`, `trash` and `restore`.
+//! Finding, reading and keeping sessions: `sessions`, `show`, `rerun`, `note`, `trash` and `restore`.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use jiff::Timestamp;
 use jiff::civil::Date;
 use jiff::tz::TimeZone;
-use ndarray::{Array2, Axis, concatenate, stack};
 use raysweep_core::Counts;
 use raysweep_processing::ProcessError;
 use raysweep_processing::calibration::CalibrationHeader;
@@ -14,24 +13,16 @@ use raysweep_proto::{RunParams, SessionInfo};
 use raysweep_session::Session;
 use raysweep_session::integrity::{Damage, DamagedPart, damaged_files};
 use raysweep_session::ledger::{EndState, Remark, State};
-use raysweep_session::report::{Picture, ToneMap};
 use serde::Serialize;
 use serde_json::Value;
 
 use super::failure::CommandFailure;
-use super::picture_file;
 use super::show::{block, duration};
-use super::thumbnails;
 
 /// Files of a session whose content `show` tells: those of them that are short, so that their checksums cost nothing.
 const READ: [&str; 4] = ["plan.toml", "rig.toml", "calibration.toml", "products/transport.json"];
 /// Longest metadata of the transport.
 const MOST_FINDINGS_BYTES: u64 = 1 << 24;
-/// Columns between the images of a picture.
-const GAP_PX: usize = 4;
-/// Percentile of the pixels that maps to white in a picture.
-const PERCENTILE: f64 = 99.5;
-
 /// Which sessions to list; those that fit all of it.
 #[derive(Debug, Default, clap::Args)]
 pub(super) struct SessionFilter {
@@ -108,13 +99,13 @@ pub(super) struct SessionView {
     state: String,
     error: Option<String>,
     /// Warnings of its latest run.
-    warnings: Vec<String>,
-    stored: usize,
-    points: usize,
-    counts: Counts,
+    pub warnings: Vec<String>,
+    pub stored: usize,
+    pub points: usize,
+    pub counts: Counts,
     light_s: Option<f64>,
     /// What of the files that this was read from is damaged.
-    damage: Vec<String>,
+    pub damage: Vec<String>,
     /// `plan.toml`, by key.
     settings: BTreeMap<String, String>,
     /// When the calibration was measured that it uses.
@@ -123,7 +114,7 @@ pub(super) struct SessionView {
     remarks: Vec<Remark>,
     report: Option<PathBuf>,
     /// The arrays and images of its products.
-    products: Vec<PathBuf>,
+    pub products: Vec<PathBuf>,
     /// Pictures that any program shows.
     pictures: Vec<PathBuf>,
     /// Small pictures, if they were asked for.
@@ -244,206 +235,6 @@ impl SessionView {
     }
 }
 
-/// What differs between two sessions.
-#[derive(Debug, Serialize)]
-pub(super) struct Compared {
-    /// What is damaged of the files that were compared, in each session.
-    damage: [Vec<String>; 2],
-    /// Sentences about plan, rig file, calibration and software; empty if nothing differs.
-    settings: Vec<String>,
-    /// Points stored, of those planned.
-    stored: [[usize; 2]; 2],
-    counts: [Counts; 2],
-    /// Warnings of each session's latest run that the other's does not have.
-    warnings: [Vec<String>; 2],
-    /// Products that both have, with the same shape.
-    products: BTreeMap<String, Difference>,
-    /// Products that only one of them has, or that have another shape.
-    unlike: Vec<String>,
-    /// The picture, if one was asked for.
-    pub picture: Option<PictureOfDifference>,
-}
-
-/// The difference of an image, B - A.
-#[derive(Debug, Serialize, PartialEq)]
-struct Difference {
-    /// Root mean square of the first image.
-    rms: f64,
-    /// Root mean square of the difference.
-    rms_difference: f64,
-    /// The largest difference of a pixel, with its sign.
-    largest: f64,
-}
-
-impl Compared {
-    /// Compares two sessions.
-    pub fn read(folders: [&Path; 2]) -> Result<Self, CommandFailure> {
-        let [a, b] = folders;
-        let [mut first, mut second] = [SessionView::read(a)?, SessionView::read(b)?];
-        let names = |shown: &SessionView| -> BTreeSet<String> {
-            let stem = |path: &PathBuf| Some(path.file_stem()?.to_str()?.to_owned());
-            shown.products.iter().filter_map(stem).filter(|name| !name.ends_with("_mask")).collect()
-        };
-        let found = [names(&first), names(&second)];
-        for ((dir, view), names) in folders.iter().zip([&mut first, &mut second]).zip(&found) {
-            let session = Session::open(dir).map_err(ProcessError::from)?;
-            view.check_products(&session, &names.iter().cloned().collect::<Vec<_>>())?;
-        }
-        let [of_first, of_second] = found;
-        let (mut products, mut unlike) = (BTreeMap::new(), Vec::new());
-        for name in of_first.union(&of_second) {
-            match (image(a, name), image(b, name)) {
-                (Some(first), Some(second)) if first.dim() == second.dim() => {
-                    products.insert(name.clone(), Difference::of(&first, &second));
-                }
-                // Arrays of more axes follow from the same stack.
-                (None, None) => {}
-                _ => unlike.push(name.clone()),
-            }
-        }
-        let only = |one: &SessionView, other: &SessionView| {
-            one.warnings.iter().filter(|warning| !other.warnings.contains(warning)).cloned().collect()
-        };
-        Ok(Self {
-            warnings: [only(&first, &second), only(&second, &first)],
-            damage: [first.damage, second.damage],
-            settings: changes(a, b)?,
-            picture: None,
-            stored: [[first.stored, first.points], [second.stored, second.points]],
-            counts: [first.counts, second.counts],
-            products,
-            unlike,
-        })
-    }
-
-    /// As text.
-    pub fn text(&self) -> String {
-        let mut rows = Vec::new();
-        let mut title = "settings";
-        if self.settings.is_empty() {
-            rows.push((title, "the same".to_owned()));
-        }
-        for said in &self.settings {
-            rows.push((title, said.clone()));
-            title = "";
-        }
-        for (which, ([stored, points], counts)) in ["A", "B"].iter().zip(self.stored.iter().zip(&self.counts))
-        {
-            let Counts { expected, averaged, .. } = counts;
-            rows.push((
-                which,
-                format!(
-                    "{stored} of {points} points stored, {averaged} frames used of {expected}, {}",
-                    counts.losses()
-                ),
-            ));
-        }
-        for (which, warnings) in ["A", "B"].iter().zip(&self.warnings) {
-            rows.extend(warnings.iter().map(|warning| ("warning", format!("only in {which}: {warning}"))));
-        }
-        title = "products";
-        for (name, Difference { rms, rms_difference, largest }) in &self.products {
-            let share =
-                if *rms > 0.0 { format!(" ({:.2} %)", 100.0 * rms_difference / rms) } else { String::new() };
-            rows.push((
-                title,
-                format!("{name}: RMS of B - A {rms_difference:.3e}{share}, at most {largest:+.3e}"),
-            ));
-            title = "";
-        }
-        rows.extend(self.unlike.iter().map(|name| ("", format!("{name}: not in both, or of another shape"))));
-        for (which, damage) in ["A", "B"].iter().zip(&self.damage) {
-            rows.extend(damage.iter().map(|damage| ("DAMAGED", format!("in {which}, {damage}"))));
-        }
-        rows.extend(self.picture.iter().map(|picture| ("picture", picture.legend())));
-        block(&rows)
-    }
-}
-
-impl Difference {
-    fn of(a: &Array2<f32>, b: &Array2<f32>) -> Self {
-        let difference = b.mapv(f64::from) - a.mapv(f64::from);
-        let rms = |image: &Array2<f64>| (image.mapv(|value| value * value).mean().unwrap_or(0.0)).sqrt();
-        let largest = difference
-            .iter()
-            .copied()
-            .fold(0.0, |most: f64, value| if value.abs() > most.abs() { value } else { most });
-        Self { rms: rms(&a.mapv(f64::from)), rms_difference: rms(&difference), largest }
-    }
-}
-
-/// What a picture of a difference shows, from left to right: A, B, and B - A.
-#[derive(Debug, Serialize)]
-pub(super) struct PictureOfDifference {
-    file: PathBuf,
-    product: String,
-    /// The product's unit; empty if its file does not say it.
-    units: String,
-    /// The value that is white in A and B.
-    white: f32,
-    /// The size of the difference at which red and blue are full.
-    full_difference: f32,
-}
-
-impl PictureOfDifference {
-    fn legend(&self) -> String {
-        let Self { file, product, units, white, full_difference } = self;
-        let units = if units.is_empty() { String::new() } else { format!("\nunit: {units}") };
-        format!(
-            "{}\n{product} of A, of B, and B - A, from left to right\nA and B: black is 0, white is {white:.3e} or more\nB - A: black is 0, red is B > A, full at +{full_difference:.3e}, blue is B < A, full at -{full_difference:.3e}{units}",
-            file.display()
-        )
-    }
-}
-
-/// Writes a picture of a product in two sessions and of their difference, side by side, as a PNG file. The first two have
-/// one scale, and the difference its own.
-pub(super) fn write_picture_of_difference(
-    folders: [&Path; 2],
-    product: &str,
-    file: PathBuf,
-) -> Result<PictureOfDifference, CommandFailure> {
-    let [a, b] = folders.map(|folder| {
-        image(folder, product).ok_or_else(|| {
-            CommandFailure::Sessions(format!(
-                "{} has no image {product}: `raysweep show` lists its products",
-                folder.display()
-            ))
-        })
-    });
-    let (a, b) = (a?, b?);
-    if a.dim() != b.dim() {
-        let message =
-            format!("{product} has {:?} pixels in one session and {:?} in the other", a.dim(), b.dim());
-        return Err(CommandFailure::Sessions(message));
-    }
-    let difference = &b - &a;
-    let scaled = |image: &Array2<f32>, ToneMap { white }: ToneMap| image.mapv(|light| light / white);
-    let common = ToneMap::percentile(&[a.view(), b.view()], PERCENTILE);
-    let own = ToneMap::percentile(&[difference.mapv(f32::abs).view()], PERCENTILE);
-    let (a, b, difference) = (scaled(&a, common), scaled(&b, common), scaled(&difference, own));
-    let gap = Array2::zeros((a.nrows(), GAP_PX));
-    let (positive, negative) =
-        (difference.mapv(|light| light.max(0.0)), difference.mapv(|light| -light.min(0.0)));
-    let none = Array2::zeros(a.dim());
-    let failed = |error| CommandFailure::Output(std::io::Error::other(error));
-    let channels = [&positive, &none, &negative].map(|shown| {
-        concatenate(Axis(1), &[a.view(), gap.view(), b.view(), gap.view(), shown.view()]).map_err(failed)
-    });
-    let [red, green, blue] = channels;
-    let all = stack(Axis(2), &[red?.view(), green?.view(), blue?.view()]).map_err(failed)?;
-    let png = Picture::rgb(all.view(), ToneMap { white: 1.0 }).to_png().map_err(ProcessError::from)?;
-    picture_file::write(&file, &png)?;
-    let about = thumbnails::about(&folders[0].join("products").join(format!("{product}.npy")));
-    Ok(PictureOfDifference {
-        file,
-        product: product.to_owned(),
-        units: about["units"].as_str().unwrap_or_default().to_owned(),
-        white: common.white,
-        full_difference: own.white,
-    })
-}
-
 /// The plan of a session and what is known of it, for the same run again.
 pub(super) fn run_again(dir: &Path) -> Result<RunParams, CommandFailure> {
     let session = Session::open(dir).map_err(ProcessError::from)?;
@@ -470,37 +261,8 @@ pub(super) fn run_again(dir: &Path) -> Result<RunParams, CommandFailure> {
     })
 }
 
-/// What differs between the settings of two sessions, in a sentence each.
-pub(super) fn changes(before: &Path, after: &Path) -> Result<Vec<String>, CommandFailure> {
-    let mut found = Vec::new();
-    let open = |dir| Session::open(dir).map_err(ProcessError::from);
-    let [first, second] = [open(before)?, open(after)?];
-    for file in ["plan.toml", "rig.toml"] {
-        let (a, b) = (flat(&first, file)?, flat(&second, file)?);
-        let keys: BTreeSet<&String> = a.keys().chain(b.keys()).collect();
-        for key in keys {
-            match (a.get(key), b.get(key)) {
-                (Some(a), Some(b)) if a == b => {}
-                (Some(a), Some(b)) => found.push(format!("{file}: {key} = {b}, was {a}")),
-                (None, Some(b)) => found.push(format!("{file}: {key} = {b}, was not given")),
-                (Some(a), None) => found.push(format!("{file}: {key} is not given, was {a}")),
-                (None, None) => {}
-            }
-        }
-    }
-    let made = |dir| calibration_of(dir).map_or_else(|| "none".to_owned(), |made| made.to_string());
-    let software = |session: &Session| -> Result<String, CommandFailure> {
-        Ok(session.state().map_err(ProcessError::from)?.session.software)
-    };
-    let others =
-        [("calibration", made(before), made(after)), ("software", software(&first)?, software(&second)?)];
-    let changed = others.into_iter().filter(|(_, a, b)| a != b);
-    found.extend(changed.map(|(what, a, b)| format!("{what}: {b}, was {a}")));
-    Ok(found)
-}
-
 /// The values of a TOML file of a session by their keys, such as `sweep.delay_us`.
-fn flat(session: &Session, file: &str) -> Result<BTreeMap<String, String>, CommandFailure> {
+pub(super) fn flat(session: &Session, file: &str) -> Result<BTreeMap<String, String>, CommandFailure> {
     fn walk(prefix: &str, value: &toml::Value, found: &mut BTreeMap<String, String>) {
         let below = |key: &str| if prefix.is_empty() { key.to_owned() } else { format!("{prefix}.{key}") };
         match value {
@@ -525,7 +287,8 @@ fn flat(session: &Session, file: &str) -> Result<BTreeMap<String, String>, Comma
     Ok(found)
 }
 
-fn calibration_of(dir: &Path) -> Option<Timestamp> {
+/// When the calibration that a session was taken with was made.
+pub(super) fn calibration_of(dir: &Path) -> Option<Timestamp> {
     CalibrationHeader::read(dir).ok().flatten().map(|header| header.made)
 }
 
@@ -538,11 +301,6 @@ fn findings_of(session: &Session) -> BTreeMap<String, String> {
     findings.map(|(key, said)| (key.clone(), said.as_str().unwrap_or_default().to_owned())).collect()
 }
 
-/// An image among a session's products.
-fn image(dir: &Path, name: &str) -> Option<Array2<f32>> {
-    Session::open(dir).ok()?.products().read_image(name).ok()
-}
-
 /// What is damaged of these files of a session, in a sentence each.
 fn damaged(session: &Session, state: &State, files: &[String]) -> Result<Vec<String>, CommandFailure> {
     let damage = damaged_files(session, state, files).map_err(ProcessError::from)?;
@@ -551,7 +309,6 @@ fn damaged(session: &Session, state: &State, files: &[String]) -> Result<Vec<Str
 
 #[cfg(test)]
 mod tests {
-    use ndarray::arr2;
 
     use super::*;
 
@@ -607,12 +364,5 @@ mod tests {
         let viewfinder = SessionInfo { kind: VIEWFINDER.into(), ..info() };
         let shows = |words: &[&str]| Line::try_parse_from(words).unwrap().filter.shows(&viewfinder);
         assert!(!shows(&["sessions"]) && shows(&["sessions", "--kind", "viewfinder"]));
-    }
-
-    #[test]
-    fn the_difference_of_images_is_that_of_their_pixels() {
-        let (a, b) = (arr2(&[[3.0, 4.0]]), arr2(&[[3.0, 1.0]]));
-        let found = Difference::of(&a, &b);
-        assert_eq!((found.rms, found.rms_difference, found.largest), (12.5_f64.sqrt(), 4.5_f64.sqrt(), -3.0));
     }
 }
