@@ -253,7 +253,7 @@ fn only_the_page_itself_is_let_in_and_only_with_its_users_rights() {
         }
         let listed = page.call("sessions", json!({}));
         assert_eq!(listed["result"].as_array().unwrap().len(), 1, "{listed}");
-        assert!(listed["text"].as_str().unwrap().starts_with(&why), "{listed}");
+        assert!(listed["shown"].as_str().unwrap().starts_with(&why), "{listed}");
         assert!(lab.said().contains("you are an observer") && lab.said().contains(&why), "{}", lab.said());
     }
 }

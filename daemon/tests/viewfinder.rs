@@ -20,6 +20,7 @@ use raysweep_proto::{
     Client, ErrorCode, Event, ResumeParams, RunParams, RunState, ViewfinderParams, ViewfinderValues,
 };
 use raysweep_session::Session;
+use raysweep_sim::scene::Scene;
 use raysweep_sim::{LensControl, LensOf, PlaneTruth};
 use tempfile::TempDir;
 use tokio::sync::broadcast;
@@ -435,8 +436,8 @@ const BRIGHT: &str = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndri
 
 /// What the sensor makes of the scene in an exposure, from the light alone and the sensor's data: the share of samples
 /// above the limit, and the median signal over noise.
-fn brute_force(rig: &Rig, exposure_us: f64) -> (f64, f64) {
-    let light = rig.simulated().unwrap().noise_free(0.0, exposure_us).unwrap();
+fn brute_force(rig: &Rig, delay_us: f64, exposure_us: f64) -> (f64, f64) {
+    let light = rig.simulated().unwrap().noise_free(delay_us, exposure_us).unwrap();
     let signals_e: Vec<f64> = light.iter().map(|&light| f64::from(light) * 2800.0 * 1.66).collect();
     let noise_e = |e: f64| (81.0 + e).sqrt();
     let limit_e = (0.97 * 4095.0 - 64.0) * 1.66;
@@ -458,10 +459,10 @@ fn the_proposed_exposure_saturates_nothing_and_is_as_good_as_the_best_of_all() {
     let proposed: serde_json::Value = serde_json::from_str(&said).unwrap();
     let exposure_us = proposed["exposure_us"].as_f64().unwrap();
     let rig = Rig::load(&program.folder.path().join("rig.toml")).unwrap();
-    let (_, ratio) = brute_force(&rig, exposure_us);
+    let (_, ratio) = brute_force(&rig, 0.0, exposure_us);
     let best = (0..=100)
         .map(|step| 100.0 * 150_f64.powf(f64::from(step) / 100.0))
-        .map(|us| (us, brute_force(&rig, us)))
+        .map(|us| (us, brute_force(&rig, 0.0, us)))
         .filter(|(_, (share, _))| *share <= 1e-4)
         .max_by(|(_, (_, a)), (_, (_, b))| a.total_cmp(b))
         .unwrap();
@@ -484,6 +485,39 @@ fn the_proposed_exposure_saturates_nothing_and_is_as_good_as_the_best_of_all() {
     program.plan("kind = \"darks\"\n");
     let refused = program.raysweep(&["expose", "plan.toml"]);
     assert!(String::from_utf8(refused.stderr).unwrap().contains("no exposures to choose"));
+}
+
+/// Its own row hardly lights a pixel, five rows further down light it strongly: at delay 0, no exposure of the plan saturates.
+#[test]
+fn the_proposed_exposure_suits_the_delay_at_which_the_scene_is_brightest() {
+    const ROWS: usize = 96;
+    let folder = tempfile::tempdir().unwrap();
+    let scene = folder.path().join("scene.npz");
+    let light = |v: usize, t: usize| match v.checked_sub(t) {
+        Some(0) => 0.05,
+        Some(14..=18) => 0.4,
+        _ => 0.0,
+    };
+    let transport = ndarray::Array4::from_shape_fn((ROWS, ROWS, 24, 1), |(v, t, _, _)| light(v, t));
+    Scene::from_transport(transport, None).unwrap().save(&scene).unwrap();
+    let rig = BRIGHT
+        .replace("\"mix\"\nscene_rows = 96\nscene_columns = 96", &format!("{:?}", scene.to_str().unwrap()));
+    assert_ne!(rig, BRIGHT);
+    let program = Program::start(&rig);
+    program.plan(
+        "kind = \"sweep\"\n[sweep]\ndelay_us = [-355, 0, 355]\nexposure_us = [20, 40, 80, 160, 320, 500]\n",
+    );
+    let output = program.raysweep(&["--json", "expose", "plan.toml"]);
+    let said = String::from_utf8(output.stdout).unwrap();
+    assert!(output.status.success(), "{said} {}", String::from_utf8_lossy(&output.stderr));
+    let proposed: serde_json::Value = serde_json::from_str(&said).unwrap();
+    let exposure_us = proposed["exposure_us"].as_f64().unwrap();
+    let rig = Rig::load(&program.folder.path().join("rig.toml")).unwrap();
+    let share = |delay_us, exposure_us| brute_force(&rig, delay_us, exposure_us).0;
+    assert!(share(0.0, 500.0) < 1e-4, "delay 0 tells nothing");
+    let shares = [exposure_us, 1.1 * exposure_us].map(|us| share(355.0, us));
+    println!("{exposure_us} us: saturated {shares:?}");
+    assert!(shares[0] <= 1e-4 && shares[1] > 1e-4, "{shares:?} in {exposure_us} us and a tenth more");
 }
 
 #[test]

@@ -15,6 +15,7 @@ expect.set_options(timeout=PATIENCE_MS)
 LONG = plan.replace("average = 4", "average = 400")
 assert LONG != plan
 SHORT = "kind = \"sweep\"\nname = \"asked\"\n[sweep]\ndelay_us = [-300, 0, 300]\nexposure_us = [500]\naverage = 2\n"
+FILM = "kind = \"film\"\nname = \"film\"\n[film]\ncycles = 5\n[[product]]\nname = \"epipolar\"\nkind = \"epipolar\"\n"
 SCHEMES = ["light", "dark"]
 WIDTHS = [1280, 400]
 
@@ -65,7 +66,7 @@ def first_visit(page):
     expect(page.locator("#checked")).to_contain_text("sweep.average")
     page.fill("#plan", LONG)
     page.click("#check")
-    expect(page.locator("#checked")).to_contain_text("frames")
+    expect(page.locator("#checked dt", has_text="frames")).to_be_visible()
     shot(page, "check")
     page.click("#start")
     # A run that is still being prepared would leave no session.
@@ -148,6 +149,29 @@ def warnings(page):
     shot(page, "warnings")
 
 
+def videos(page):
+    """Looks at the images of a film one by one."""
+    page.goto(address)
+    film = run(page, FILM)
+    page.click("#tab-sessions")
+    page.locator(f"#sessions .choose[title='{film}']").click()
+    which = page.locator("#session .images")
+    expect(which).to_contain_text("1 of 5")
+    readout = page.locator("#session .readout")
+    page.locator("#session canvas.image").focus()
+    page.keyboard.press("ArrowDown")
+    expect(readout).to_contain_text("row 25, column 16")
+    first = readout.text_content()
+    page.locator("#session .images input").focus()
+    for _ in range(4):
+        page.keyboard.press("ArrowRight")
+    expect(which).to_contain_text("5 of 5")
+    # The same pixel in other frames has other noise.
+    expect(readout).not_to_have_text(first)
+    expect(readout).to_contain_text("row 25, column 16")
+    shots(page, "film")
+
+
 def many_tabs(context):
     """Tabs that are not seen hold none of the six connections that a browser has to an address."""
     tabs = [context.new_page() for _ in range(8)]
@@ -216,6 +240,7 @@ with sync_playwright() as playwright:
             viewfinder(page)
             questions(page)
             warnings(page)
+            videos(page)
             many_tabs(context)
         visit(page, f"{scheme}-{width}")
         context.close()

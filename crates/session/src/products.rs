@@ -206,6 +206,25 @@ impl Products {
     /// # Errors
     /// [`Error::Io`] if it is missing or too large for the memory, [`Error::Codec`] if it is damaged.
     pub fn read_array(&self, name: &str) -> Result<ArrayD<f32>> {
+        self.with_array(name, |array| Ok(array.to_owned()))
+    }
+
+    /// Reads back image `k` of a sequence or video, `[t, s]` or `[t, s, rgb]`, and how many images there are.
+    ///
+    /// # Errors
+    /// As [`Products::read_array`], and [`Error::Shape`] if there is no such image.
+    pub fn read_image_of(&self, name: &str, k: usize) -> Result<(ArrayD<f32>, usize)> {
+        self.with_array(name, |array| match array.shape() {
+            [images, _, _, ..] if k < *images => Ok((array.index_axis(Axis(0), k).to_owned(), *images)),
+            shape => Err(Error::Shape {
+                what: format!("product `{name}`, of which image {k} is wanted, counted from 0"),
+                found: shape.to_vec(),
+                allowed: format!("[{} or more, t, s] or [.., t, s, rgb]", k.saturating_add(1)),
+            }),
+        })
+    }
+
+    fn with_array<T>(&self, name: &str, read: impl FnOnce(ArrayViewD<'_, f32>) -> Result<T>) -> Result<T> {
         let path = self.path(name, "npy")?;
         let failed = || Error::io("read", &path);
         let mut file = self.open(&path)?;
@@ -217,8 +236,7 @@ impl Products {
         aligned.resize(values, 0.0);
         let bytes: &mut [u8] = &mut bytemuck::cast_slice_mut(&mut aligned)[..length];
         io::Read::read_exact(&mut file, bytes).map_err(failed())?;
-        let view = ArrayViewD::<f32>::view_npy(bytes).map_err(Error::codec("read", path.display()))?;
-        Ok(view.to_owned())
+        read(ArrayViewD::<f32>::view_npy(bytes).map_err(Error::codec("read", path.display()))?)
     }
 
     /// The files of all products, by path; those of a video are in a folder of their own. Symbolic links are left out.

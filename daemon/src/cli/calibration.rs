@@ -11,6 +11,7 @@ use serde_json::json;
 
 use super::exit::Exit;
 use super::failure::CommandFailure;
+use super::folders::folder_of;
 use super::printer::Printer;
 
 /// The plan of `raysweep calibrate`.
@@ -21,7 +22,8 @@ pub(super) const PLAN: &str = "kind = \"calibration\"\n";
 pub(super) enum CalibrationCommand {
     /// Show a calibration
     Show {
-        /// Folder of the session that measured it, or of one that used it [default: the calibration in use]
+        /// The session that measured it, or one that used it: its folder, or its name within the daemon's data folder
+        /// [default: the calibration in use]
         session: Option<PathBuf>,
     },
     /// List the calibrations in the daemon's data folder, oldest first
@@ -31,11 +33,11 @@ pub(super) enum CalibrationCommand {
         /// The session's folder, or its name within the daemon's data folder
         session: PathBuf,
     },
-    /// Compare two calibrations; needs no daemon
+    /// Compare two calibrations; needs no daemon if their folders are given
     Compare {
-        /// Folder of the first
+        /// Session of the first: its folder, or its name within the daemon's data folder
         first: PathBuf,
-        /// Folder of the second
+        /// Session of the second
         second: PathBuf,
     },
 }
@@ -48,7 +50,10 @@ pub(super) fn calibration(
 ) -> Result<Exit, CommandFailure> {
     match command {
         CalibrationCommand::Show { session } => {
-            let folder = session.map_or_else(|| in_use(socket), Ok)?;
+            let folder = match session {
+                Some(session) => folder_of(session, socket)?,
+                None => in_use(socket)?,
+            };
             let kept = read(&folder)?;
             printer.print(&json!(kept.header), |_| shown(&kept))?;
         }
@@ -63,7 +68,8 @@ pub(super) fn calibration(
             printer.print(&Empty {}, |_| done())?;
         }
         CalibrationCommand::Compare { first, second } => {
-            let difference = Comparison::new(&read(&first)?, &read(&second)?)?;
+            let read = |session| read(&folder_of(session, socket)?);
+            let difference = Comparison::new(&read(first)?, &read(second)?)?;
             printer.print(&difference.to_json(), |_| difference.to_string())?;
         }
     }

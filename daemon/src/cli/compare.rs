@@ -239,7 +239,8 @@ pub(super) fn changes(before: &Path, after: &Path) -> Result<Vec<String>, Comman
             }
         }
     }
-    let made = |dir| calibration_of(dir).map_or_else(|| "none".to_owned(), |made| made.to_string());
+    let shown = |made: jiff::Timestamp| made.strftime("%Y-%m-%d %H:%M:%S UTC").to_string();
+    let made = |dir| calibration_of(dir).map_or_else(|| "none".to_owned(), shown);
     let software = |session: &Session| -> Result<String, CommandFailure> {
         Ok(session.state().map_err(ProcessError::from)?.session.software)
     };

@@ -383,10 +383,10 @@ struct Proposed {
 impl Proposed {
     fn value(&self) -> serde_json::Value {
         let Self { tried: Tried { exposure_us, saturated, headroom, .. }, average, report, plan, .. } = self;
-        let expected = report.advice.as_ref().map(|advice| advice.expected);
+        let (rig, expected) = report.advice.as_ref().map(|advice| (&advice.rig, &advice.expected)).unzip();
         json!({
             "exposure_us": exposure_us, "saturated": saturated, "headroom": headroom, "average": average,
-            "light_s": report.light_s, "expected": expected, "plan": plan, "warnings": report.warnings,
+            "light_s": report.light_s, "expected": expected, "rig": rig, "plan": plan, "warnings": report.warnings,
         })
     }
 
@@ -414,6 +414,7 @@ impl Proposed {
         head.push(format!("{:.2} s of light", report.light_s));
         if let Some(advice) = &report.advice {
             head.push(format!("expected error: {}", show::errors(&advice.expected)));
+            head.push(format!("the rig is known: {}", show::accuracy(&advice.rig)));
         }
         head.extend(report.warnings.iter().map(|warning| format!("warning: {warning}")));
         let comments: String = head.into_iter().map(|comment| format!("# {comment}\n")).collect();

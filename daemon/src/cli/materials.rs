@@ -11,7 +11,7 @@ use super::printer::Printer;
 
 pub(super) fn tell(
     command: MaterialsCommand,
-    folder_of: impl Fn(PathBuf) -> PathBuf,
+    folder_of: impl Fn(PathBuf) -> Result<PathBuf, CommandFailure>,
     printer: Printer,
 ) -> Result<(), CommandFailure> {
     match command {
@@ -32,7 +32,7 @@ pub(super) fn tell(
             })?;
         }
         MaterialsCommand::Apply { session, model, window, scene, to } => {
-            let applied = apply(&folder_of(session), &model, scale(scene)?, window, &to)?;
+            let applied = apply(&folder_of(session)?, &model, scale(scene)?, window, &to)?;
             printer.print(&json!(applied), |_| {
                 let materials =
                     applied.materials.iter().map(|(name, pixels)| format!("{pixels:>9} px {name}"));
@@ -62,7 +62,7 @@ pub(super) fn profiles(
     labelled: LabelledArguments,
     ProfileLook { refractive_index, maps }: ProfileLook,
     to: &Path,
-    folder_of: impl Fn(PathBuf) -> PathBuf,
+    folder_of: impl Fn(PathBuf) -> Result<PathBuf, CommandFailure>,
     printer: Printer,
 ) -> Result<(), CommandFailure> {
     let options = SpreadOptions { mm_per_row: scale(labelled.scene)?, refractive_index, maps };
@@ -100,7 +100,7 @@ fn scale(SceneScale { mm_per_row }: SceneScale) -> Result<Option<f64>, CommandFa
 /// Each session with its file of labels.
 fn pairs(
     LabelledArguments { sessions, labels, .. }: LabelledArguments,
-    folder_of: impl Fn(PathBuf) -> PathBuf,
+    folder_of: impl Fn(PathBuf) -> Result<PathBuf, CommandFailure>,
 ) -> Result<Vec<Labelled>, CommandFailure> {
     let of = |at: usize| -> Option<&Path> {
         labels.get(if labels.len() == 1 { 0 } else { at }).map(PathBuf::as_path)
@@ -112,9 +112,9 @@ fn pairs(
             sessions.len()
         )));
     }
-    let pair = |(at, session)| {
+    let pair = |(at, session)| -> Result<Labelled, CommandFailure> {
         let labels = of(at).map(Path::to_owned).unwrap_or_default();
-        Labelled { session: folder_of(session), labels }
+        Ok(Labelled { session: folder_of(session)?, labels })
     };
-    Ok(sessions.into_iter().enumerate().map(pair).collect())
+    sessions.into_iter().enumerate().map(pair).collect()
 }

@@ -11,6 +11,7 @@ mod exit;
 mod expose;
 mod failure;
 mod finder_text;
+mod folders;
 mod follow;
 mod manuals;
 mod materials;
@@ -27,7 +28,7 @@ mod view;
 mod viewfinder;
 mod watch;
 
-use std::ffi::{OsStr, OsString};
+use std::ffi::OsString;
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -44,6 +45,7 @@ use self::compare::{Compared, write_picture_of_difference};
 pub use self::doctor::text as doctor_text;
 use self::exit::Exit;
 use self::failure::CommandFailure;
+use self::folders::{folder_of, trashed_folder_of};
 use self::follow::{Interrupts, OnInterrupt, follow};
 use self::plan_file::read_plan;
 use self::printer::{Printer, printable};
@@ -54,9 +56,9 @@ use self::viewfinder::{Wanted, change_or_plan, changed};
 use raysweep_processing::{
     Asked, ExportFormat, ExportScope, ProcessError, copy_acquired, export, export_as, process_asked,
 };
+use raysweep_session::Session;
 use raysweep_session::integrity::Audit;
 use raysweep_session::ledger::Remark;
-use raysweep_session::{Session, TRASH};
 
 /// Where the packaged daemon listens.
 const DEFAULT_SOCKET: &str = "/run/raysweep/raysweepd.sock";
@@ -182,7 +184,7 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             printer.print(&listed, |sessions| show::sessions(sessions, fitting - sessions.len()))?;
         }
         Command::Show { session, thumbnails } => {
-            let session = folder_of(session, &socket);
+            let session = folder_of(session, &socket)?;
             let mut view = SessionView::read(&session)?;
             if let Some(folder) = thumbnails {
                 let session = Session::open(&session).map_err(ProcessError::from)?;
@@ -192,7 +194,7 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             printer.print(&view, SessionView::text)?;
         }
         Command::Diff { a, b, picture, product } => {
-            let (a, b) = (folder_of(a, &socket), folder_of(b, &socket));
+            let (a, b) = (folder_of(a, &socket)?, folder_of(b, &socket)?);
             let mut compared = Compared::read([&a, &b])?;
             if let Some(file) = picture {
                 compared.picture = Some(write_picture_of_difference([&a, &b], &product, file)?);
@@ -200,20 +202,20 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             printer.print(&compared, Compared::text)?;
         }
         Command::Rerun { session, detach } => {
-            return rerun(&socket, printer, &folder_of(session, &socket), detach);
+            return rerun(&socket, printer, &folder_of(session, &socket)?, detach);
         }
         Command::Note { session, text, by } => {
             if text.trim().is_empty() {
                 return Err(CommandFailure::Sessions("the remark is empty: say something".into()));
             }
             let remark = Remark { at: jiff::Timestamp::now(), by, text };
-            let noted =
-                Session::open(&folder_of(session, &socket)).and_then(|session| session.note(remark.clone()));
+            let session = folder_of(session, &socket)?;
+            let noted = Session::open(&session).and_then(|session| session.note(remark.clone()));
             noted.map_err(ProcessError::from)?;
             printer.print(&remark, |_| "noted".into())?;
         }
         Command::Trash { session, for_good } => {
-            let session = Session::open(&folder_of(session, &socket)).map_err(ProcessError::from)?;
+            let session = Session::open(&folder_of(session, &socket)?).map_err(ProcessError::from)?;
             let dir = session.dir().to_owned();
             match for_good {
                 true => {
@@ -233,7 +235,7 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             printer.print(&json!({ "moved_to": to }), |_| format!("moved to {}", to.display()))?;
         }
         Command::Process { session, to, products, only, memory, accept_damage, accept_edits } => {
-            let session = folder_of(session, &socket);
+            let session = folder_of(session, &socket)?;
             if let Some(to) = &to {
                 copy_acquired(&session, to)?;
             }
@@ -253,7 +255,7 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             });
             printer.print(&value, |_| show::processed(&made))?;
         }
-        Command::Verify { session } => return verify(&folder_of(session, &socket), printer),
+        Command::Verify { session } => return verify(&folder_of(session, &socket)?, printer),
         Command::Materials(command) => materials::tell(command, |given| folder_of(given, &socket), printer)?,
         Command::Profiles { labelled, refractive_index, maps, to } => {
             let about = materials::ProfileLook { refractive_index, maps };
@@ -266,7 +268,7 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             if stack && !matches!(format, None | Some(ExportFormat::Zip)) {
                 return Err(CommandFailure::Sessions(STACK_WITH_FORMAT.into()));
             }
-            let session = folder_of(session, &socket);
+            let session = folder_of(session, &socket)?;
             let to = to.unwrap_or_else(|| export_path(&session, format));
             let scope = if stack { ExportScope::ResultsAndArrays } else { ExportScope::Results };
             let files = match format {
@@ -373,62 +375,6 @@ fn begin_run(
 fn socket_path(argument: Option<PathBuf>, variable: Option<OsString>) -> PathBuf {
     let variable = variable.filter(|value| !value.is_empty()).map(PathBuf::from);
     argument.or(variable).unwrap_or_else(|| DEFAULT_SOCKET.into())
-}
-
-/// The folder of a session, which is given by its folder, or by its name in the data folder of the daemon, if that answers.
-fn folder_of(given: PathBuf, socket: &Path) -> PathBuf {
-    if given.exists() || given.components().count() != 1 {
-        return given;
-    }
-    let listed = Client::connect(socket).and_then(|mut client| client.sessions()).unwrap_or_default();
-    let named = listed.into_iter().find(|info| info.session.file_name() == Some(given.as_os_str()));
-    named.map_or(given, |info| info.session)
-}
-
-/// The folder of a session in the trash, which is given by its folder, or by its name if the daemon answers.
-fn trashed_folder_of(given: PathBuf, socket: &Path) -> Result<PathBuf, CommandFailure> {
-    if given.exists() {
-        return Ok(given);
-    }
-    let trash = match given.parent() {
-        Some(folder) if folder.file_name() == Some(TRASH.as_ref()) => folder.to_owned(),
-        // `raysweep sessions` lists no trash, so that an error about a folder of that name would lead nowhere.
-        Some(folder) if folder.as_os_str().is_empty() => {
-            let status = Client::connect(socket).and_then(|mut client| client.status());
-            let data = status.ok().and_then(|status| status.data).ok_or_else(|| {
-                let name = given.display();
-                let why = "no daemon answers that could look it up in its trash; give its folder in .trash";
-                CommandFailure::Trash(format!("there is no folder {name} here, and {why}"))
-            })?;
-            data.join(TRASH)
-        }
-        _ => return Ok(given),
-    };
-    let name = given.file_name().unwrap_or_default();
-    let folder = trash.join(name);
-    if folder.exists() { Ok(folder) } else { Err(CommandFailure::Trash(not_in_trash(&trash, name))) }
-}
-
-/// Most names of sessions in the trash that are listed.
-const LISTED: usize = 10;
-
-/// Says what is in the trash instead, the newest first.
-fn not_in_trash(trash: &Path, name: &OsStr) -> String {
-    let missing = format!("there is no {} in the trash", name.display());
-    let mut names: Vec<String> = match fs::read_dir(trash) {
-        Ok(entries) => entries.flatten().map(|entry| entry.file_name().display().to_string()).collect(),
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Vec::new(),
-        Err(error) => return format!("{missing}, or {} cannot be read: {error}", trash.display()),
-    };
-    // Names begin with the time at which the run began.
-    names.sort_by(|a, b| b.cmp(a));
-    let more = names.len().saturating_sub(LISTED);
-    names.truncate(LISTED);
-    match (names.as_slice(), more) {
-        ([], _) => format!("{missing}: it is empty"),
-        (names, 0) => format!("{missing}; it holds: {}", names.join(", ")),
-        (names, more) => format!("{missing}; it holds: {}, and {more} older ones", names.join(", ")),
-    }
 }
 
 const STACK_WITH_FORMAT: &str =

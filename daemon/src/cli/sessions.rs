@@ -39,10 +39,10 @@ pub(super) struct SessionFilter {
     #[arg(long = "tag", value_name = "TAG")]
     tags: Vec<String>,
     /// Only those begun on this day or later, in UTC, such as 2026-11-22
-    #[arg(long, value_name = "DATE")]
+    #[arg(long, value_name = "DATE", value_parser = day)]
     since: Option<Date>,
     /// Only those begun on this day or earlier, in UTC
-    #[arg(long, value_name = "DATE")]
+    #[arg(long, value_name = "DATE", value_parser = day)]
     until: Option<Date>,
     /// Only those in this state
     #[arg(long, value_name = "STATE", value_parser = ["complete", "cancelled", "faulted", "unfinished", "unreadable"])]
@@ -56,6 +56,10 @@ pub(super) struct SessionFilter {
 const KINDS: [&str; 8] =
     ["sweep", "film", "batches", "response", "darks", "patterns", "calibration", VIEWFINDER];
 const VIEWFINDER: &str = "viewfinder";
+
+fn day(given: &str) -> Result<Date, &'static str> {
+    given.parse().map_err(|_not_a_date| "not a day, such as 2026-11-22")
+}
 
 impl SessionFilter {
     /// Whether a session that fits is shown: viewfinders are only if they are asked for.

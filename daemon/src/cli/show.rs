@@ -11,9 +11,11 @@ use raysweep_proto::{
     PlanAdvice, Progress, RigAccuracy, Role, RunState, SessionInfo, Status,
 };
 
-use super::printer::printable;
 use raysweep_processing::Processed;
 use raysweep_session::integrity::{Audit, Damage};
+use serde::Serialize;
+
+use super::printer::printable;
 
 /// Text of `status`.
 pub(super) fn status(status: &Status) -> String {
@@ -123,8 +125,21 @@ fn mirror(mirror: &MirrorStatus) -> String {
     format!("{place}, light {laser}; {word}")
 }
 
+/// What `check` says: rows of a word and a text, and tables of settings with what they are.
+#[derive(Serialize)]
+pub(super) struct Checked {
+    rows: Vec<(&'static str, String)>,
+    tables: Vec<(&'static str, String)>,
+}
+
 /// Text of `check`.
 pub(super) fn check(report: &CheckReport) -> String {
+    let Checked { rows, tables } = checked(report);
+    tables.iter().fold(block(&rows), |text, (what, table)| format!("{text}\n\n# {what}\n{table}"))
+}
+
+/// What `check` says, for the terminal and the page.
+pub(super) fn checked(report: &CheckReport) -> Checked {
     let mut rows = vec![
         (
             "points",
@@ -209,7 +224,8 @@ pub(super) fn check(report: &CheckReport) -> String {
     let better = report.advice.iter().filter_map(|advice| advice.better.as_ref());
     let chosen = report.settings.iter().map(|table| ("the settings that are taken", table));
     let tables = chosen.chain(better.map(|better| ("better settings", &better.table)));
-    tables.fold(block(&rows), |text, (what, table)| format!("{text}\n\n# {what}\n{}", table.trim_end()))
+    let tables = tables.map(|(what, table)| (what, table.trim_end().to_owned())).collect();
+    Checked { rows, tables }
 }
 
 /// Expected errors and advice of `check`; the better settings' tables follow the rows.
@@ -241,7 +257,9 @@ fn advice(advice: &PlanAdvice) -> Vec<(&'static str, String)> {
 }
 
 /// How well the rig is taken to be known.
-fn accuracy(RigAccuracy { calibrated, latency_us, edge_us, place_rows, .. }: &RigAccuracy) -> String {
+pub(super) fn accuracy(
+    RigAccuracy { calibrated, latency_us, edge_us, place_rows, .. }: &RigAccuracy,
+) -> String {
     let source = match calibrated {
         true => "as calibrated",
         false => {

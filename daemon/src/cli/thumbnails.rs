@@ -1,18 +1,20 @@
-//! The products of a session that are pictures, and small PNG files of them.
+//! The products of a session that are pictures or several (sequences and videos), and small PNG files of them.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use ndarray::{Axis, Ix3};
+use ndarray::{ArrayD, Axis, Ix3};
 use raysweep_session::report::{Picture, ToneMap};
 use raysweep_session::{Session, input};
-use serde_json::{Value, json};
+use serde_json::Value;
 
 use super::failure::CommandFailure;
 use super::picture_file;
 
 /// Largest picture, in bytes: 4096 x 4096 values and the header of their file.
 const MOST_PICTURE_BYTES: u64 = (4 << 24) + (1 << 16);
+/// Largest sequence or video, in bytes: it is read whole for one image of it.
+const MOST_VIDEO_BYTES: u64 = 1 << 28;
 /// Largest description of a product.
 const MOST_ABOUT_BYTES: u64 = 1 << 24;
 /// Pictures that say most of a session, best first.
@@ -20,15 +22,17 @@ const BEST: [&str; 3] = ["epipolar", "regular", "floodlit"];
 /// The brightest half per cent of the pixels is white.
 const WHITE_PERCENT: f64 = 99.5;
 
-/// Names of the products that are pictures: those that say most, then the others, sorted.
+/// Names of the products that are pictures or several: those that say most, then the others, sorted.
 pub(super) fn pictures(session: &Session) -> Vec<String> {
     let files = session.products().files();
     let mut names: Vec<String> = files
         .iter()
         .filter(|path| path.parent() == Some(&session.products_path()))
         .filter(|path| path.extension().is_some_and(|ending| ending == "npy"))
-        .filter(|path| path.metadata().is_ok_and(|it| it.is_file() && it.len() <= MOST_PICTURE_BYTES))
-        .filter(|path| is_picture(&about(path)))
+        .filter(|path| {
+            let most = most_bytes(&about(path));
+            path.metadata().is_ok_and(|it| it.is_file() && most.is_some_and(|most| it.len() <= most))
+        })
         .filter_map(|path| Some(path.file_stem()?.to_str()?.to_owned()))
         .collect();
     names.sort();
@@ -42,16 +46,39 @@ pub(super) fn about(product: &Path) -> Value {
     text.and_then(|text| serde_json::from_slice(&text).ok()).unwrap_or_default()
 }
 
-fn is_picture(about: &Value) -> bool {
-    [json!(["t", "s"]), json!(["t", "s", "rgb"])].contains(&about["axes"])
+/// Largest file of a product that is shown, by its axes; none for what is no picture.
+fn most_bytes(about: &Value) -> Option<u64> {
+    let axes: Vec<&str> = about["axes"].as_array()?.iter().filter_map(Value::as_str).collect();
+    match axes[..] {
+        ["t", "s"] | ["t", "s", "rgb"] => Some(MOST_PICTURE_BYTES),
+        ["k", "t", "s"] | ["k", "t", "s", "rgb"] => Some(MOST_VIDEO_BYTES),
+        _ => None,
+    }
 }
 
-/// A picture of a session as a small PNG file, with its own white; `None` if its file holds no picture.
+/// Image `k` of a product, `[t, s]` or `[t, s, rgb]`, and how many it has; a picture has one.
+///
+/// # Errors
+/// If its file cannot be read, or there is no such image.
+pub(super) fn image(
+    session: &Session,
+    name: &str,
+    k: usize,
+) -> raysweep_session::Result<(ArrayD<f32>, usize)> {
+    let products = session.products();
+    match about(&products.dir().join(format!("{name}.npy")))["axes"][0] == "k" {
+        true => products.read_image_of(name, k),
+        false => Ok((products.read_array(name)?, 1)),
+    }
+}
+
+/// A picture of a session, or the first of several, as a small PNG file, with its own white; `None` if its file holds no
+/// picture.
 ///
 /// # Errors
 /// If the file cannot be read.
 pub(super) fn small(session: &Session, name: &str) -> raysweep_session::Result<Option<Vec<u8>>> {
-    let image = session.products().read_array(name)?;
+    let (image, _) = image(session, name, 0)?;
     let image = if image.ndim() == 2 { image.insert_axis(Axis(2)) } else { image };
     // The dimensions in the file may contradict the names of the axes beside it.
     let Ok(image) = image.into_dimensionality::<Ix3>() else { return Ok(None) };

@@ -134,6 +134,12 @@ impl<'a> RigOfRun<'a> {
     }
 }
 
+/// What a run finds, in a sentence each, that a calibration may have served.
+pub fn found_of_calibration(is_calibrated: bool) -> Vec<String> {
+    let said = "not calibrated: times and levels are those of the rig file, and errors may be many times larger than foreseen; `raysweep calibrate` measures them";
+    if is_calibrated { Vec::new() } else { vec![said.to_owned()] }
+}
+
 /// Stores the calibration that a run uses in its session.
 ///
 /// # Errors

@@ -101,6 +101,9 @@ fn sessions_are_moved_away_and_back_and_deleted_only_for_good() {
     done(&["trash", text(&session)]);
     let trashed = data.path().join(".trash/20260101-000000_sweep");
     assert!(!session.exists() && trashed.exists());
+    let (exit, _, err) = run(&["show", text(&session)]);
+    let way_back = format!("`raysweep restore {}`", trashed.display());
+    assert!(exit == 1 && err.contains(&way_back), "{exit} {err}");
     let listed = raysweep_session::list(data.path()).unwrap();
     assert!(listed.sessions.is_empty() && listed.unreadable.is_empty());
     // Another of the same name is not overwritten, neither there nor here.

@@ -54,7 +54,7 @@ pub(crate) fn settings(state: &State, task: &PlaneTask) -> Block {
     let mut entries = vec![
         ("stages", stages.collect::<Vec<_>>().join(", ")),
         ("row time", row_times(geometry)),
-        ("first row after VSYNC", format!("{} µs", geometry.raster.first_row_us)),
+        ("first row after VSYNC", format!("{:.3} µs", geometry.raster.first_row_us)),
         (
             "projector rows",
             format!(
@@ -86,7 +86,7 @@ fn row_times(geometry: &SweepGeometry) -> String {
 
 fn white(geometry: &SweepGeometry) -> String {
     let median = if geometry.calibration.is_some() { ", the median of the pixels" } else { "" };
-    format!("{} counts above black{median}", geometry.white_dn)
+    format!("{:.1} counts above black{median}", geometry.white_dn)
 }
 
 /// How a row's light spreads in space and time, according to the model.

@@ -68,6 +68,14 @@ fn a_sequence_has_a_layer_for_each_image() {
     assert_eq!(exr_channels(&products.dir().join("line.exr")), expected);
     let back: Array3<f32> = read_npy(products.dir().join("line.npy")).unwrap();
     assert_eq!(back, values);
+    assert_eq!(
+        products.read_image_of("line", 2).unwrap(),
+        (values.index_axis(Axis(0), 2).to_owned().into_dyn(), 3)
+    );
+    let beyond = products.read_image_of("line", 3).unwrap_err().to_string();
+    assert!(beyond.contains("image 3") && beyond.contains("[4 or more, t, s]"), "{beyond}");
+    products.image("single", values.index_axis(Axis(0), 0), &metadata()).unwrap();
+    assert!(matches!(products.read_image_of("single", 0), Err(Error::Shape { .. })));
     let short = products.sequence("line", values.view(), &layers[..2], &metadata());
     assert!(matches!(short, Err(Error::Shape { .. })));
 }

@@ -174,8 +174,8 @@ struct Call {
     params: Map<String, Value>,
 }
 
-/// Carries out a call of the daemon: `{"result": ..., "text": ...}` or `{"error": {"code": ..., "message": ...}}`. The
-/// text is the report of `check`, or why the files of `sessions` may not be read.
+/// Carries out a call of the daemon: `{"result": ..., "shown": ...}` or `{"error": {"code": ..., "message": ...}}`. What
+/// is shown are the rows and tables of `check`, or why the files of `sessions` may not be read.
 async fn call(State(view): State<Arc<View>>, body: Bytes) -> Response {
     let call: Call = match serde_json::from_slice(&body) {
         Ok(call) => call,
@@ -188,18 +188,20 @@ async fn call(State(view): State<Arc<View>>, body: Bytes) -> Response {
     let answer = spawn_blocking(move || {
         let _turn = turn;
         let result: Value = Client::connect(&socket)?.call(method, &call.params)?;
-        let text = match method {
-            Method::Check => serde_json::from_value(result.clone()).ok().map(|report| show::check(&report)),
+        let shown = match method {
+            Method::Check => {
+                serde_json::from_value(result.clone()).ok().map(|report| json!(show::checked(&report)))
+            }
             Method::Sessions => {
                 let newest = result.as_array().and_then(|sessions| sessions.last()?["session"].as_str());
-                newest.and_then(|session| barred(Path::new(session)))
+                newest.and_then(|session| barred(Path::new(session))).map(Value::from)
             }
             _ => None,
         };
-        Ok::<_, ClientError>((result, text))
+        Ok::<_, ClientError>((result, shown))
     });
     match answer.await {
-        Ok(Ok((result, text))) => Json(json!({ "result": result, "text": text })).into_response(),
+        Ok(Ok((result, shown))) => Json(json!({ "result": result, "shown": shown })).into_response(),
         Ok(Err(ClientError::Rpc(error))) => Json(json!({ "error": error })).into_response(),
         Ok(Err(error)) => Json(json!({ "error": { "message": error.to_string() } })).into_response(),
         Err(_) => {
@@ -282,11 +284,19 @@ async fn thumbnail(
     .await
 }
 
+#[derive(Deserialize)]
+struct Image {
+    /// Which of a product's images, counted from 0.
+    #[serde(default)]
+    k: usize,
+}
+
 async fn product(
     State(view): State<Arc<View>>,
     Segment((_, session, product)): Segment<(String, String, String)>,
+    Query(Image { k }): Query<Image>,
 ) -> Response {
-    read_session(view, session, move |folder| Ok(stored::picture(folder, &product)?.into_response())).await
+    read_session(view, session, move |folder| Ok(stored::picture(folder, &product, k)?.into_response())).await
 }
 
 /// Light from each projector row to a pixel.

@@ -9,7 +9,7 @@ use raysweep_session::{Session, transport};
 use serde_json::{Value, json};
 
 use super::super::sessions::SessionView;
-use super::super::thumbnails::{about, pictures, small};
+use super::super::thumbnails::{about, image, pictures, small};
 use super::pictures::Encoded;
 
 /// Largest report, in bytes.
@@ -45,17 +45,16 @@ pub(super) fn report(folder: &Path) -> Result<Vec<u8>, String> {
     session.read(&path, MOST_REPORT_BYTES).map_err(told)
 }
 
-/// A product that is a picture.
-pub(super) fn picture(folder: &Path, product: &str) -> Result<Encoded, String> {
+/// Image `k` of a product that is a picture or several, with their number `of`.
+pub(super) fn picture(folder: &Path, product: &str, k: usize) -> Result<Encoded, String> {
     // Names come from a browser: only those that exist are opened.
     let session = Session::open(folder).map_err(told)?;
     if !pictures(&session).iter().any(|name| name == product) {
         return Err(format!("this session has no picture called {product:?}"));
     }
-    let products = session.products();
-    let image = products.read_array(product).map_err(told)?;
-    let about = about(&products.dir().join(format!("{product}.npy")));
-    Ok(Encoded::new(image.view(), json!({ "name": product, "about": about })))
+    let (image, of) = image(&session, product, k).map_err(told)?;
+    let about = about(&session.products().dir().join(format!("{product}.npy")));
+    Ok(Encoded::new(image.view(), json!({ "name": product, "about": about, "of": of })))
 }
 
 /// The picture that says most of a session, as a small PNG file, if it has any.

@@ -1,7 +1,7 @@
 // The viewfinder's figures, what it shows, and the region that they are of.
 
 import { by, note } from "./main.js";
-import { element, number } from "./picture.js";
+import { element, number, pairs } from "./picture.js";
 import { line, plotIn } from "./plots.js";
 
 const PICTURES = ["white", "black", "grid", "rows", "cross", "align"];
@@ -67,8 +67,7 @@ export function showFinder(values) {
   }
   const [top, bottom, left, right] = values.region;
   rows.push(["region", `rows ${top} to ${bottom - 1}, columns ${left} to ${right - 1}`]);
-  by("finder-figures").replaceChildren(
-    ...rows.flatMap(([key, value]) => [element("dt", {}, key), element("dd", {}, value)]));
+  by("finder-figures").replaceChildren(...pairs(rows));
   const advice = (alignment?.advice ?? []).map((text) => note("warn", text));
   by("finder-advice").replaceChildren(...advice, ...(values.problem ? [note("bad", values.problem)] : []));
   for (const button of by("finder-pictures").children) {

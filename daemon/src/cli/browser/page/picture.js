@@ -26,7 +26,7 @@ const HALVES = Float32Array.from({ length: 65536 }, (_, bits) => {
   return sign * (exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : 2 ** -14 * (fraction / 1024));
 });
 
-/** Decodes what the server sends: {name, about, sequence, shape, values}. */
+/** Decodes what the server sends: {name, about, shape, values}, of a live picture its sequence, of a stored one `of`. */
 export function decode(buffer) {
   const length = new DataView(buffer).getUint32(0, true);
   const head = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
@@ -67,6 +67,9 @@ export const element = (name, attributes = {}, ...children) => {
   made.append(...children.filter((child) => child != null));
   return made;
 };
+
+/** What a list of figures contains, from pairs of a word and a text. */
+export const pairs = (rows) => rows.flatMap(([key, value]) => [element("dt", {}, key), element("dd", {}, value)]);
 
 /** Draws values into a canvas of one pixel each. */
 export function paint(canvas, picture, colours, low, high) {

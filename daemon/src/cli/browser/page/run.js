@@ -4,12 +4,15 @@ import { by, call, note } from "./main.js";
 import { marksOf, showFinder, startFinder } from "./finder.js";
 import { startDelays } from "./delays.js";
 import { line, plotIn } from "./plots.js";
-import { Picture, element, fetchPicture, number } from "./picture.js";
+import { Picture, element, fetchPicture, number, pairs } from "./picture.js";
 
 const UNDER_WAY = ["preparing", "armed", "running", "paused", "draining"];
 
 /** Nobody ends a viewfinder whose tab was closed: it ends by itself, with its light, after an hour. */
 const FINDER = "kind = \"viewfinder\"\n[viewfinder]\nseconds = 3600\n";
+
+/** What `raysweep calibrate` runs. */
+const CALIBRATION = "kind = \"calibration\"\n";
 
 const clock = (seconds) => {
   if (!Number.isFinite(seconds)) return "unknown";
@@ -45,6 +48,7 @@ export function startRun() {
   by("check").addEventListener("click", check);
   by("start").addEventListener("click", () => start(by("plan").value));
   by("find").addEventListener("click", () => start(FINDER));
+  by("calibrate").addEventListener("click", () => start(CALIBRATION));
   watchPictures(startFinder(order));
   setInterval(() => { if (!document.hidden) refresh(); }, 2000);
   return hear;
@@ -116,7 +120,8 @@ function draw() {
   by("pause").disabled = !["armed", "running"].includes(state);
   by("continue").disabled = state !== "paused" || Boolean(question?.wants_answer);
   by("cancel").disabled = !isUnderWay;
-  for (const id of ["start", "check", "find"]) by(id).disabled = isUnderWay || !state;
+  for (const id of ["start", "check", "find", "calibrate"]) by(id).disabled = isUnderWay || !state;
+  by("calibrate").hidden = status.rig !== "plane";
   // A viewfinder stores nothing.
   const stores = Boolean(progress?.points_planned);
   by("progress").hidden = !stores;
@@ -137,8 +142,7 @@ function draw() {
     const { parked, laser } = status.mirror;
     rows.push(["mirror", `${parked ? "parked" : "not parked"}, laser ${laser ? "on" : "off"}`]);
   }
-  by("figures").replaceChildren(
-    ...rows.flatMap(([key, value]) => [element("dt", {}, key), element("dd", {}, value)]));
+  by("figures").replaceChildren(...pairs(rows));
   const notes = complaint ? [note("bad", complaint)] : [];
   if (status.ended) notes.push(note(status.ended === "complete" ? "good" : "warn", `The run is ${status.ended}.`));
   if (status.error) notes.push(note("bad", status.error));
@@ -165,27 +169,29 @@ function addJitter(vsync) {
   row.forEach((value, axis) => jitter[axis].push(value));
   if (jitter[0].length > 3600) jitter.forEach((values) => values.shift());
   const lines = [line(0, "standard deviation", { points: { show: true, size: 4 } }), line(1, "99 %", { dash: [4, 3] })];
-  jitterPlot ??= plotIn(by("vsync"), { x: "time since the page was opened, s", y: "µs", lines, height: 150 }, jitter);
+  jitterPlot ??= plotIn(by("vsync"), { x: "time since the page was opened, s", y: "µs", lines, height: 150, legend: true }, jitter);
   jitterPlot.setData(jitter);
 }
 
 async function check() {
-  by("checked").hidden = false;
-  by("checked").className = "checked";
-  by("checked").textContent = "checking …";
-  const { error, text } = await call("check", { plan: by("plan").value });
-  by("checked").className = error ? "checked bad" : "checked";
-  by("checked").textContent = error ? mistakes(error) : text;
+  tellChecked(element("p", { class: "quiet" }, "checking …"));
+  const { error, shown } = await call("check", { plan: by("plan").value });
+  if (error) tellChecked(...mistakes(error));
+  else tellChecked(element("dl", { class: "figures" }, ...pairs(shown.rows)), ...shown.tables.flatMap(([what, table]) =>
+    [element("h3", {}, what), element("pre", {}, table)]));
 }
 
-const mistakes = (error) => (error.data?.mistakes ?? []).map((mistake) => mistake.message).join("\n") || error.message;
+function tellChecked(...parts) {
+  by("checked").hidden = !parts.length;
+  by("checked").replaceChildren(...parts);
+}
+
+const mistakes = (error) => (error.data?.mistakes ?? [error]).map(({ message }) => note("bad", message));
 
 async function start(plan) {
-  for (const id of ["start", "find"]) by(id).disabled = true;
+  for (const id of ["start", "find", "calibrate"]) by(id).disabled = true;
   const { error } = await call("run", { plan });
-  by("checked").hidden = !error;
-  by("checked").className = "checked bad";
-  by("checked").textContent = error ? mistakes(error) : "";
+  tellChecked(...(error ? mistakes(error) : []));
   complaint = null;
   refresh();
 }
@@ -234,11 +240,20 @@ async function watchPictures({ onregion, onmarks }) {
       button.setAttribute("aria-pressed", String(button.textContent === name));
     }
   };
+  /** What is shown, and whether it is of an earlier run: the file keeps the newest picture of each name. */
+  const tellAbout = () => {
+    if (!shown) return;
+    const session = nameOf(shown.about.session);
+    const isOld = UNDER_WAY.includes(status.state) && session !== nameOf(status.session);
+    picture.element.classList.toggle("old", isOld);
+    by("live-about").textContent = (isOld ? "of an earlier run: " : "") + describe(shown);
+  };
   const look = async () => {
     const answer = await fetch("live");
     const found = answer.ok ? await answer.json() : {};
     // A daemon that was started again counts from 1.
     if ((found[chosen] ?? 0) < sequence) sequence = 0;
+    tellAbout();
     by("live-none").hidden = answer.ok && shown !== null;
     by("live-none").textContent = answer.ok
       ? "No live picture yet. A run publishes its first after some points." : await answer.text();
@@ -264,7 +279,7 @@ async function watchPictures({ onregion, onmarks }) {
         picture.show(newest);
         // What the run has stored since belongs to the plot too.
         if (picture.at) onpixel(...picture.at);
-        by("live-about").textContent = describe(newest);
+        tellAbout();
       } else if (!newest) {
         await wait(chosen ? 0.05 : 1);
       }

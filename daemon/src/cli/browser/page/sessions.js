@@ -1,7 +1,7 @@
 // Sessions on disk: a list with thumbnails, one session, and two side by side with their difference.
 
 import { by, call, note } from "./main.js";
-import { Picture, element, fetchPicture, number } from "./picture.js";
+import { Picture, element, fetchPicture, number, pairs } from "./picture.js";
 import { line, plotIn } from "./plots.js";
 
 const nameOf = (folder) => folder.split("/").pop();
@@ -27,12 +27,12 @@ export function startSessions({ watch }) {
   };
 
   async function list() {
-    // The text says why the sessions' files may not be read.
-    const { result, error, text } = await call("sessions");
-    const notes = [error?.message, text && `What sessions contain is not shown: ${text}.`];
+    // Why the sessions' files may not be read, if so.
+    const { result, error, shown: barred } = await call("sessions");
+    const notes = [error?.message, barred && `What sessions contain is not shown: ${barred}.`];
     by("sessions-notes").replaceChildren(...notes.filter(Boolean).map((why) => note("warn", why)));
     if (!result) return;
-    listed = result.reverse().map((info) => ({ ...info, mayRead: !text }));
+    listed = result.reverse().map((info) => ({ ...info, mayRead: !barred }));
     drawList();
   }
 
@@ -88,6 +88,8 @@ export function startSessions({ watch }) {
       const images = two ? one.images.filter((name) => two.images.includes(name)) : one.images;
       const menu = element("select", { "aria-label": "Picture" }, ...images.map((name) => element("option", {}, name)));
       const sides = element("div", { class: "sides" });
+      const [slider, which] = [element("input", { type: "range", min: "0", value: "0" }), element("span")];
+      const choice = element("label", { class: "images" }, "Image ", slider, which);
       const plot = element("div", { hidden: true });
       const link = (session, text) =>
         element("a", { href: address(session, "/report"), target: "_blank", rel: "noopener" }, text);
@@ -98,10 +100,15 @@ export function startSessions({ watch }) {
           !two && one.can_resume ? resume(first, place) : null),
         ...[one, two].filter(Boolean).flatMap(({ session, damage, warnings }) => [...damage, ...warnings]
           .map((what) => note("warn", two ? `${nameOf(session)}: ${what}` : what))),
-        two ? differences(one, two) : figures(one), sides, plot);
+        two ? differences(one, two) : figures(one), choice, sides, plot);
+      choice.hidden = true;
       const pixel = profile(plot, [one, two].filter(Boolean));
-      const draw = () => pictures(sides, [first, second], menu, pixel);
-      menu.addEventListener("change", draw);
+      const draw = pictures({ sides, menu, slider, which, choice }, [first, second], pixel);
+      menu.addEventListener("change", () => {
+        slider.value = 0;
+        draw();
+      });
+      slider.addEventListener("input", draw);
       if (images.length) await draw();
       else sides.replaceChildren(element("p", { class: "empty" },
         two ? "The two have no picture in common." : "This session has no pictures."));
@@ -138,8 +145,7 @@ function rowsOf(session) {
 }
 
 function figures(session) {
-  return element("dl", { class: "figures" }, ...rowsOf(session).filter(([, value]) => value)
-    .flatMap(([key, value]) => [element("dt", {}, key), element("dd", {}, value)]));
+  return element("dl", { class: "figures" }, ...pairs(rowsOf(session).filter(([, value]) => value)));
 }
 
 /** A table of what differs. */
@@ -160,32 +166,53 @@ function joined(one, two) {
   return both;
 }
 
-async function pictures(sides, [first, second], menu, onpixel) {
-  const name = menu.value;
-  const of = (session) => fetchPicture(address(session, `/picture/${encodeURIComponent(name)}`));
-  const [one, two] = await Promise.all([of(first), second && of(second)]);
-  // Another picture was chosen meanwhile.
-  if (name !== menu.value) return;
-  sides.replaceChildren();
-  // In two pictures side by side, the same light has the same brightness.
-  const range = two && joined(one.values, two.values);
-  const side = (title, picture, options = { range }) => {
-    const box = element("div", {}, element("h3", {}, title));
-    sides.append(box);
-    const view = new Picture(box, { label: `${name} of ${title}`, onpixel, ...options });
-    view.show(picture);
+/** Returns what shows the chosen image of the chosen product: of one session, or of two with their difference. */
+function pictures({ sides, menu, slider, which, choice }, [first, second], onpixel) {
+  // Zoom, colours and limits stay from image to image of a product.
+  let [views, product] = [[], null];
+  return async () => {
+    const [name, k] = [menu.value, slider.value];
+    const of = (session) => fetchPicture(address(session, `/picture/${encodeURIComponent(name)}?k=${k}`));
+    const [one, two] = await Promise.all([of(first), second && of(second)]);
+    // Another was chosen meanwhile.
+    if (name !== menu.value || k !== slider.value) return;
+    const count = Math.min(one.of, two ? two.of : one.of);
+    slider.max = count - 1;
+    choice.hidden = count < 2;
+    which.textContent = `${Number(k) + 1} of ${count}`;
+    const shown = two ? compared(one, two, [first, second]) : [{ title: name, picture: one }];
+    if (product !== name) {
+      sides.replaceChildren();
+      views = shown.map(({ title, picture, ...options }) => {
+        const [box, heading] = [element("div"), element("h3")];
+        box.append(heading);
+        sides.append(box);
+        const view = new Picture(box, { label: `${name} of ${title}`, onpixel, ...options });
+        return Object.assign(view, { heading });
+      });
+      product = name;
+    }
+    for (const [at, { title, picture, range }] of shown.entries()) {
+      views[at].heading.textContent = title;
+      views[at].range = range;
+      views[at].show(picture);
+    }
+    if (two && shown.length < 3 && sides.children.length < 3) {
+      sides.append(note("warn", "The pictures differ in size, so there is no difference to show."));
+    }
   };
-  side(second ? first : name, one);
-  if (!two) return;
-  side(second, two);
-  if (one.shape.join() !== two.shape.join()) {
-    sides.append(note("warn", "The pictures differ in size, so there is no difference to show."));
-    return;
-  }
+}
+
+/** Two pictures, in which the same light has the same brightness, and their difference if they are of one size. */
+function compared(one, two, [first, second]) {
+  const range = joined(one.values, two.values);
+  const sides = [{ title: first, picture: one, range }, { title: second, picture: two, range }];
+  if (one.shape.join() !== two.shape.join()) return sides;
   const values = one.values.map((value, at) => two.values[at] - value);
   const square = (value) => (Number.isFinite(value) ? value * value : 0);
   const rms = Math.sqrt(values.reduce((sum, value) => sum + square(value), 0) / values.length);
-  side(`second − first, RMS ${number(rms)}`, { ...one, values }, { colours: "difference", symmetric: true });
+  const title = `second − first, RMS ${number(rms)}`;
+  return [...sides, { title, picture: { ...one, values }, colours: "difference", symmetric: true }];
 }
 
 /** Profiles over u, `{u_min, light}`, on the u that any of them has: `[u, light, ...]`, null where one has none. */
