@@ -72,6 +72,12 @@ fn program_on(path: &OsStr, name: &str) -> Option<PathBuf> {
     })
 }
 
+/// Fails with the messages of all parts that failed.
+pub fn all(parts: impl IntoIterator<Item = Done>) -> Done {
+    let errors: Vec<String> = parts.into_iter().filter_map(Done::err).collect();
+    if errors.is_empty() { Ok(()) } else { Err(errors.join("\n")) }
+}
+
 /// Prints a line. A reader that has closed the pipe is not an error.
 pub fn say(line: &str) -> Done {
     match writeln!(std::io::stdout(), "{line}") {

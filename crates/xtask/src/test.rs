@@ -2,11 +2,11 @@
 
 use std::process::Command;
 
-use crate::run::{Done, cargo, run, target};
+use crate::run::{self, Done, cargo, run, target};
 use crate::{binaries, guest, packages, python, rootfs, space};
 
-/// The most that all of this command has on the disk of the target folder, without incremental files. Where temporary
-/// files are on it too, they are gone before the guests' disks are made.
+/// The most that all of this command has on the disk of the target folder, without incremental files, if temporary files
+/// are on it too.
 const TARGET_GIB: u64 = 11;
 /// What cargo's incremental files add, unless CARGO_INCREMENTAL forbids them.
 const INCREMENTAL_GIB: u64 = 3;
@@ -36,16 +36,17 @@ pub fn test(wanted: Guest) -> Done {
     let built = binaries::build()?;
     has_space()?;
     // All failures at once: the next look at them is far away.
-    let tested = binaries::run_tests(&built, &[("RAYSWEEP_PYTHON", &python)]);
-    run(cargo().args(["test", "--workspace", "--all-features", "--doc", "--quiet"]))?;
-    tested?;
-    match wanted {
-        Guest::Run => guest::both(),
-        Guest::Skip => {
-            println!("{}", guest::skipped());
-            Ok(())
-        }
-    }
+    let parts = std::thread::scope(|scope| {
+        // Most tests wait for the time of devices; what they leave of the cores, machines in emulation can use.
+        let guests = scope.spawn(|| match wanted {
+            Guest::Run => guest::both(&built),
+            Guest::Skip => run::say(&guest::skipped()),
+        });
+        let tested = binaries::run_tests(&built, &[("RAYSWEEP_PYTHON", &python)]);
+        let documented = run(cargo().args(["test", "--workspace", "--all-features", "--doc", "--quiet"]));
+        [tested, documented, guests.join().unwrap_or_else(|_| Err("the guests' thread panicked".to_owned()))]
+    });
+    run::all(parts)
 }
 
 /// Fails, before anything is installed or built, where tests cannot have networks of their own, in which simulated

@@ -166,11 +166,11 @@ impl LiveFile {
         }
 
         let mut slots = self.slots.lock().unwrap_or_else(PoisonError::into_inner);
-        slots.bytes.clear();
-        slots.bytes.extend_from_slice(metadata.as_bytes());
-        slots.bytes.resize(METADATA_BYTES, 0);
         slots.bytes.resize(METADATA_BYTES + size_of::<f32>() * image.len(), 0);
-        let (bytes, image) = (&mut slots.bytes[METADATA_BYTES..], image.as_standard_layout());
+        let (head, bytes) = slots.bytes.split_at_mut(METADATA_BYTES);
+        head.fill(0);
+        head[..metadata.len()].copy_from_slice(metadata.as_bytes());
+        let image = image.as_standard_layout();
         let pixels = bytes.chunks_exact_mut(size_of::<f32>()).zip(image.as_slice().unwrap_or_default());
         pixels.for_each(|(bytes, pixel)| bytes.copy_from_slice(&pixel.to_le_bytes()));
         let (index, sequence) = (slots.next(), slots.sequence + 1);

@@ -1,8 +1,9 @@
 //! How sharp a picture is.
 
+use std::borrow::Cow;
 use std::collections::VecDeque;
 
-use ndarray::{ArrayView1, ArrayView2};
+use ndarray::{Array2, ArrayView1, ArrayView2};
 use rayon::prelude::*;
 
 use super::levels::CountScale;
@@ -42,27 +43,34 @@ pub struct Focus {
 /// them, then adds nothing to the score.
 #[derive(Debug, Default)]
 pub struct FocusMeter {
-    before: Option<Gradients>,
+    before: Option<Array2<u16>>,
     scores: VecDeque<f64>,
     best: f64,
 }
 
 impl FocusMeter {
-    /// The focus of the next picture, given by the counts of its region. With a mosaic, `step` is 2, so that only
-    /// pixels of one colour are compared. `None` for the first picture, and where the mean is underexposed.
-    pub fn add(&mut self, region: ArrayView2<u16>, scale: &CountScale, step: usize) -> Option<Focus> {
-        let sum: u64 = region.iter().map(|&dn| u64::from(dn)).sum();
-        let mean = sum as f64 / region.len() as f64 - scale.black_dn;
-        let Some(own) =
-            Gradients::new(region, step).filter(|_| mean >= scale.underexposed_dn() - scale.black_dn)
-        else {
+    /// The focus of the next picture, given by the counts of its region and their mean. With a mosaic, `step` is 2, so
+    /// that only pixels of one colour are compared. `None` for the first picture, and where the mean is underexposed.
+    pub fn add(
+        &mut self,
+        region: ArrayView2<u16>,
+        mean_dn: f64,
+        scale: &CountScale,
+        step: usize,
+    ) -> Option<Focus> {
+        let size = region.dim();
+        if mean_dn < scale.underexposed_dn() || size.0.min(size.1) <= 2 * step {
             self.restart();
             return None;
-        };
-        let product = self.before.as_ref().and_then(|before| before.mean_product(&own));
+        }
+        let before = self.before.take().filter(|before| before.dim() == size);
+        let product = before.as_ref().map(|before| mean_product(before.view(), region, step));
+        // The memory of the picture before is used again.
+        let mut own = before.unwrap_or_else(|| Array2::zeros(size));
+        own.assign(&region);
         self.before = Some(own);
         // Of a flat picture only noise is left, whose product may be negative.
-        let score = (product? / (mean * mean)).max(0.0);
+        let score = (product? / (mean_dn - scale.black_dn).powi(2)).max(0.0);
         self.best = self.best.max(score);
         self.scores.push_back(score);
         if self.scores.len() > COMPARED {
@@ -77,52 +85,42 @@ impl FocusMeter {
     }
 }
 
-/// Sobel's gradient of an image without its border.
-#[derive(Debug)]
-struct Gradients {
-    /// Rows and columns.
-    size: (usize, usize),
-    /// To the right, then down: row by row, one after the other.
-    rows: Vec<f32>,
-}
-
-impl Gradients {
-    /// `None` if the image is too small.
-    fn new(image: ArrayView2<u16>, step: usize) -> Option<Self> {
-        let (rows, columns) = image.dim();
-        let size = (rows.checked_sub(2 * step)?, columns.checked_sub(2 * step)?);
-        if size.0 * size.1 == 0 {
-            return None;
-        }
-        let mut gradients = vec![0.0; 2 * size.0 * size.1];
-        gradients.par_chunks_mut(2 * size.1).enumerate().for_each(|(t, gradients)| {
-            let [up, own, down] = [0, step, 2 * step].map(|down| light(image.row(t + down)));
-            let smooth: Vec<f32> =
-                up.iter().zip(&own).zip(&down).map(|((up, own), down)| up + 2.0 * own + down).collect();
-            let fall: Vec<f32> = up.iter().zip(&down).map(|(up, down)| down - up).collect();
+/// Mean of the products of Sobel's gradients of two images of one size, without their border.
+fn mean_product(one: ArrayView2<u16>, other: ArrayView2<u16>, step: usize) -> f64 {
+    let (rows, columns) = one.dim();
+    let size = (rows - 2 * step, columns - 2 * step);
+    // Row by row, so that gradients do not leave the processor's cache.
+    let memory = || [vec![0.0; 2 * size.1], vec![0.0; 2 * size.1]];
+    let products = (0..size.0).into_par_iter().map_init(memory, |[a, b], t| {
+        for (image, gradients) in [(one, &mut *a), (other, &mut *b)] {
+            let near = [0, step, 2 * step].map(|down| counts(image.row(t + down)));
             let (across, along) = gradients.split_at_mut(size.1);
-            let sides = smooth[2 * step..].iter().zip(&smooth);
-            across.iter_mut().zip(sides).for_each(|(across, (right, left))| *across = right - left);
-            let sides = fall[2 * step..].iter().zip(&fall).zip(&fall[step..]);
-            let sums = along.iter_mut().zip(sides);
-            sums.for_each(|(along, ((right, left), own))| *along = right + 2.0 * own + left);
-        });
-        Some(Self { size, rows: gradients })
-    }
-
-    /// Mean of the products of the gradients of two images; `None` if they differ in size.
-    fn mean_product(&self, other: &Self) -> Option<f64> {
-        let length = 2 * self.size.1;
-        let rows = || self.rows.par_chunks(length).zip(other.rows.par_chunks(length));
-        let sum = || rows().map(|(own, other)| dot(own, other)).sum::<f64>();
-        (self.size == other.size).then(|| sum() / (self.size.0 * self.size.1) as f64)
-    }
+            sobel([&near[0], &near[1], &near[2]], step, across, along);
+        }
+        dot(a, b)
+    });
+    products.sum::<f64>() / (size.0 * size.1) as f64
 }
 
-/// The counts of a row as numbers.
-fn light(row: ArrayView1<u16>) -> Vec<f32> {
-    let numbers = |row: &[u16]| row.iter().map(|&dn| f32::from(dn)).collect();
-    row.as_slice().map_or_else(|| numbers(&row.to_vec()), numbers)
+/// The counts of a row, one after the other.
+fn counts(row: ArrayView1<'_, u16>) -> Cow<'_, [u16]> {
+    row.to_slice().map_or_else(|| row.to_vec().into(), Cow::from)
+}
+
+/// Sobel's gradient of a row, to the right and down, from the rows above, at and below it, as long as `across`. Sums of
+/// counts are exact as integers, and as numbers below 2^24.
+fn sobel(rows: [&[u16]; 3], step: usize, across: &mut [f32], along: &mut [f32]) {
+    let length = across.len();
+    let along = &mut along[..length];
+    // The pixels around each, as rows of one length: bounds are checked here, and not for each pixel.
+    let around = rows.map(|row| [0, step, 2 * step].map(|right| &row[right..][..length]));
+    let [[up_left, up, up_right], [left, _, right], [down_left, down, down_right]] = around;
+    for s in 0..length {
+        let at = |pixels: &[u16]| i32::from(pixels[s]);
+        let sum = |a, middle, b| at(a) + 2 * at(middle) + at(b);
+        across[s] = (sum(up_right, right, down_right) - sum(up_left, left, down_left)) as f32;
+        along[s] = (sum(down_left, down, down_right) - sum(up_left, up, up_right)) as f32;
+    }
 }
 
 /// Numbers that are added up side by side, as vector units do.
@@ -159,13 +157,17 @@ fn tendency(scores: &VecDeque<f64>) -> Tendency {
 
 #[cfg(test)]
 mod tests {
-    use ndarray::Array2;
     use rand_xoshiro::Xoshiro256PlusPlus;
     use rand_xoshiro::rand_core::{Rng, SeedableRng};
 
     use super::*;
 
     const SCALE: CountScale = CountScale { black_dn: 64.0, saturation_dn: 3972.0, full_dn: 4095 };
+
+    fn add(meter: &mut FocusMeter, picture: &Array2<u16>) -> Option<Focus> {
+        let mean_dn = picture.iter().map(|&dn| f64::from(dn)).sum::<f64>() / picture.len() as f64;
+        meter.add(picture.view(), mean_dn, &SCALE, 1)
+    }
 
     /// Stripes that rise over `width` pixels, with uniform noise of this width.
     fn stripes(width: f64, noise_dn: f64, seed: u64) -> Array2<u16> {
@@ -185,8 +187,8 @@ mod tests {
             let picture = |seed| {
                 stripes(4.0, noise_dn, seed).mapv(|dn| (64.0 + scale * (f64::from(dn) - 64.0)).round() as u16)
             };
-            assert_eq!(meter.add(picture(1).view(), &SCALE, 1), None);
-            meter.add(picture(2).view(), &SCALE, 1).unwrap().score
+            assert_eq!(add(&mut meter, &picture(1)), None);
+            add(&mut meter, &picture(2)).unwrap().score
         };
         let clean = score(0.0, 1.0);
         // A slope of 250 per pixel over half of the columns: (8 x 250)^2 where both neighbours lie on the slope.
@@ -201,27 +203,27 @@ mod tests {
         let mut meter = FocusMeter::default();
         let mut last = None;
         for (seed, width) in (0..9).map(|step| (step, 8.0 - 0.5 * step as f64)) {
-            last = meter.add(stripes(width, 20.0, seed).view(), &SCALE, 1);
+            last = add(&mut meter, &stripes(width, 20.0, seed));
         }
         let rising = last.unwrap();
         assert_eq!((rising.tendency, rising.best), (Tendency::Rising, rising.score));
         for (seed, width) in (9..18).map(|step| (step, 4.0 + 0.5 * (step - 9) as f64)) {
-            last = meter.add(stripes(width, 20.0, seed).view(), &SCALE, 1);
+            last = add(&mut meter, &stripes(width, 20.0, seed));
         }
         assert_eq!(last.unwrap().tendency, Tendency::Falling);
         assert!(last.unwrap().best > last.unwrap().score);
         let same: Vec<Tendency> = (18..66)
-            .filter_map(|seed| Some(meter.add(stripes(6.0, 20.0, seed).view(), &SCALE, 1)?.tendency))
+            .filter_map(|seed| Some(add(&mut meter, &stripes(6.0, 20.0, seed))?.tendency))
             .skip(COMPARED)
             .collect();
         let moving = same.iter().filter(|tendency| **tendency != Tendency::Steady).count();
         assert!(moving <= same.len() / 10, "{moving} of {}", same.len());
         meter.restart();
-        assert_eq!(meter.add(stripes(4.0, 0.0, 0).view(), &SCALE, 1), None);
+        assert_eq!(add(&mut meter, &stripes(4.0, 0.0, 0)), None);
         // Black, and too small.
-        assert_eq!(meter.add(Array2::from_elem((64, 64), 64).view(), &SCALE, 1), None);
+        assert_eq!(add(&mut meter, &Array2::from_elem((64, 64), 64)), None);
         meter.restart();
         let small = Array2::from_elem((2, 64), 100);
-        assert_eq!((meter.add(small.view(), &SCALE, 1), meter.add(small.view(), &SCALE, 1)), (None, None));
+        assert_eq!((add(&mut meter, &small), add(&mut meter, &small)), (None, None));
     }
 }

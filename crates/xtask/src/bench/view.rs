@@ -24,6 +24,7 @@ struct Case {
     /// Name of the live picture.
     picture: &'static str,
     camera: &'static [&'static str],
+    projector: &'static str,
     rig: &'static str,
     plan: &'static str,
 }
@@ -34,13 +35,15 @@ const CASES: [Case; 2] = [
         name: "viewfinder, 1280x720 at 15 pictures/s",
         picture: "viewfinder",
         camera: &["--test-pictures", "1280x720"],
-        rig: "scene = \"v-groove\"\nscene_rows = 16\nscene_columns = 16\n",
+        projector: "rows = 720\nrow_time_us = 22.22\nfirst_row_us = 555.5\n",
+        rig: "scene = \"v-groove\"\nscene_rows = 720\nscene_columns = 16\n",
         plan: "kind = \"viewfinder\"\n[viewfinder]\ntrigger = \"none\"\nexposure_us = 2000\npictures_per_s = 15\nseconds = 60\n",
     },
     Case {
         name: "film, 128x128 at 4 cycles/s",
         picture: "epipolar",
         camera: &[],
+        projector: "rows = 128\nrow_time_us = 22.22\nfirst_row_us = 2200\n",
         rig: "scene = \"v-groove\"\nscene_rows = 128\nscene_columns = 128\n",
         plan: "kind = \"film\"\nname = \"film\"\n[film]\ncycles = 120\n",
     },
@@ -130,9 +133,8 @@ fn measure(case: &Case, folder: &Path, is_watched: bool) -> Done<Taken> {
 fn rig(case: &Case) -> String {
     format!(
         "kind = \"plane\"\n[camera]\ndriver = \"aravis\"\naravis.address = \"127.0.0.1\"\n[vsync]\ndriver = \"sim\"\n\
-         [projector]\ndriver = \"sim\"\nrows = 128\nrow_time_us = 22.22\nfirst_row_us = 2200\n\
-         [sim]\nbench = \"bench.sock\"\nseed = 1\n{}",
-        case.rig
+         [projector]\ndriver = \"sim\"\n{}[sim]\nbench = \"bench.sock\"\nseed = 1\n{}",
+        case.projector, case.rig
     )
 }
 

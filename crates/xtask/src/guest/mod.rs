@@ -20,7 +20,7 @@ use std::time::Instant;
 
 use crate::binaries::{self, Binary};
 use crate::packages;
-use crate::run::{Done, target};
+use crate::run::{Done, all, target};
 use kernel::GuestKernel;
 use qemu::GuestClock;
 use table::{GuestTest, TESTS};
@@ -28,41 +28,38 @@ use table::{GuestTest, TESTS};
 /// Runs the given tests of the drivers, or all.
 pub fn drivers(names: &[&str]) -> Done {
     let tests = chosen(names)?;
-    Ready::make()?.drivers(&tests)
+    packages::install()?;
+    Ready::make(&binaries::build()?)?.drivers(&tests)
 }
 
 /// Runs the package under systemd.
 pub fn systemd() -> Done {
-    Ready::make()?.systemd()
+    packages::install()?;
+    Ready::make(&binaries::build()?)?.systemd()
 }
 
-/// Runs both guests, one after the other: each keeps two cores busy.
-pub fn both() -> Done {
-    let (tests, ready) = (chosen(&[])?, Ready::make()?);
-    let errors = [("kernel guest", ready.drivers(&tests)), ("systemd guest", ready.systemd())];
-    let errors = errors.into_iter().filter_map(|(name, done)| Some(format!("{name}: {}", done.err()?)));
-    match errors.collect::<Vec<_>>().join("\n") {
-        none if none.is_empty() => Ok(()),
-        errors => Err(errors),
-    }
+/// Runs both guests with what is built and installed, one after the other: each keeps two cores busy.
+pub fn both(binaries: &[Binary]) -> Done {
+    let (tests, ready) = (chosen(&[])?, Ready::make(binaries)?);
+    let named = |name: &str, done: Done| done.map_err(|error| format!("{name}: {error}"));
+    all([named("kernel guest", ready.drivers(&tests)), named("systemd guest", ready.systemd())])
 }
 
 /// What every guest needs.
-struct Ready {
+struct Ready<'a> {
     /// What guests leave is in folders of theirs in it.
     folder: PathBuf,
     kernel: GuestKernel,
     /// Built by the very command of `cargo xtask test`, so that both share build artifacts: selecting single tests would
     /// resolve other features of the dependencies and build them again.
-    binaries: Vec<Binary>,
+    binaries: &'a [Binary],
 }
 
-impl Ready {
-    fn make() -> Done<Self> {
-        packages::install()?;
+impl<'a> Ready<'a> {
+    fn make(binaries: &'a [Binary]) -> Done<Self> {
         let folder = target().join("guest");
         let kernel = GuestKernel::fetch(&folder)?;
-        Ok(Self { folder, kernel, binaries: binaries::build()? })
+        Ok(Self { folder, kernel, binaries })
     }
 
     fn drivers(&self, tests: &[&GuestTest]) -> Done {
@@ -72,8 +69,8 @@ impl Ready {
         for GuestTest { name: test, programs, .. } in tests {
             let folder = run.join(test);
             std::fs::create_dir_all(&folder).map_err(|error| format!("{}: {error}", folder.display()))?;
-            let programs = programs.iter().map(|name| (*name, find(&self.binaries, name, false)));
-            for (name, path) in [("test", find(&self.binaries, test, true))].into_iter().chain(programs) {
+            let programs = programs.iter().map(|name| (*name, find(self.binaries, name, false)));
+            for (name, path) in [("test", find(self.binaries, test, true))].into_iter().chain(programs) {
                 let copy = folder.join(name);
                 std::fs::copy(path?, &copy).map_err(|error| format!("{}: {error}", copy.display()))?;
             }
@@ -98,7 +95,7 @@ impl Ready {
     }
 
     fn systemd(&self) -> Done {
-        let daemon = find(&self.binaries, "raysweepd", false)?;
+        let daemon = find(self.binaries, "raysweepd", false)?;
         let programs = daemon.parent().ok_or("raysweepd in no folder")?;
         systemd::run(&self.folder, &self.kernel, programs)
     }

@@ -197,7 +197,7 @@ impl Finder {
         // compare stripes with their inverse.
         let focus = match values.picture {
             FinderPicture::Black | FinderPicture::Align => None,
-            _ => self.focus.add(region, &self.scale, step),
+            _ => self.focus.add(region, mean_dn, &self.scale, step),
         };
         let (rows, columns) = region.dim();
         values.pictures += 1;
