@@ -406,6 +406,12 @@ impl Runner {
 
     fn resume_session(&self, params: &ResumeParams, orders: &Arc<Orders>) -> Result<Begun, RpcError> {
         let session = self.session(&params.session)?;
+        if session.is_in_trash() {
+            let dir = session.dir().display();
+            return Err(no_session(format!(
+                "{dir} is in the trash: `raysweep restore {dir}` brings it back"
+            )));
+        }
         let read = |path: PathBuf| {
             let folders = std::slice::from_ref(&self.data);
             input::open_below(folders, &path, MOST_TEXT_BYTES)

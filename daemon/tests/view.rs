@@ -213,6 +213,12 @@ fn only_the_page_itself_is_let_in_and_only_with_its_users_rights() {
         assert_eq!(page.request("POST", &to_call, &[], body).0, 400, "{body}");
     }
     // Only sessions that the daemon lists, and of them only pictures.
+    let beyond = page.get(&format!("{session}/picture/epipolar?k=1"));
+    let said = String::from_utf8_lossy(&beyond.2).into_owned();
+    assert!(
+        beyond.0 == 404 && said.contains("picture 1 of product `epipolar`, counted from 0 of 1"),
+        "{said}"
+    );
     for path in ["session/..", "session/%2Fetc", "session/x/report", "session/..%2F..%2Fetc/picture/passwd"] {
         assert_eq!(page.get(path).0, 404, "{path}");
     }
@@ -253,7 +259,7 @@ fn only_the_page_itself_is_let_in_and_only_with_its_users_rights() {
         }
         let listed = page.call("sessions", json!({}));
         assert_eq!(listed["result"].as_array().unwrap().len(), 1, "{listed}");
-        assert!(listed["shown"].as_str().unwrap().starts_with(&why), "{listed}");
+        assert!(listed["barred"].as_str().unwrap().starts_with(&why), "{listed}");
         assert!(lab.said().contains("you are an observer") && lab.said().contains(&why), "{}", lab.said());
     }
 }
@@ -401,6 +407,26 @@ fn the_light_of_a_pixel_over_the_delays_is_that_of_the_stack() {
         let why = String::from_utf8(why).unwrap();
         assert!(status == 404 && why.contains("rows and"), "{outside}: {status} {why}");
     }
+}
+
+#[test]
+fn a_session_in_the_trash_is_said_to_be_there_and_is_not_resumed() {
+    let lab = Lab::start();
+    let session = lab.run(SWEEP);
+    let trashed = Session::open(&session).unwrap().trash().unwrap();
+    let way_back = format!("is in the trash: `raysweep restore {}`", trashed.display());
+    for command in ["show", "resume"] {
+        let output = Command::new(env!("CARGO_BIN_EXE_raysweep"))
+            .args([command, session.file_name().unwrap().to_str().unwrap(), "--socket"])
+            .arg(lab.socket())
+            .output()
+            .unwrap();
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert!(output.status.code() == Some(1) && said.contains(&way_back), "{command}: {said}");
+    }
+    let refused = &lab.view(None).call("resume", json!({ "session": trashed }))["error"];
+    assert_eq!(refused["data"]["name"], "no_session", "{refused}");
+    assert!(refused["message"].as_str().unwrap().contains(&way_back), "{refused}");
 }
 
 /// A run is checked, started, watched, paused, cancelled, resumed, finished; its report is opened; a viewfinder is worked;

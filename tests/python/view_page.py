@@ -84,6 +84,7 @@ def first_visit(page):
     shot(page, "paused")
     page.click("#continue")
     expect(page.locator("#notes")).to_contain_text("The run is complete.")
+    expect(page.locator("#notes")).to_contain_text("not calibrated")
     expect(page.locator("#figures")).to_contain_text("30 of 30")
     expect(page.locator("#live-names button")).to_have_count(3)
     expect(page.locator("#live-picture canvas.image")).to_be_visible()
@@ -166,6 +167,7 @@ def videos(page):
     for _ in range(4):
         page.keyboard.press("ArrowRight")
     expect(which).to_contain_text("5 of 5")
+    expect(which).to_contain_text("5 of 5: cycle 4")
     # The same pixel in other frames has other noise.
     expect(readout).not_to_have_text(first)
     expect(readout).to_contain_text("row 25, column 16")

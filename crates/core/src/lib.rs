@@ -1,5 +1,5 @@
 //! The vocabulary of a light-transport rig: units, pixel formats, frames and their pool, clocks, device traits,
-//! the accounting of frames, and errors.
+//! the accounting of frames, the headers of NumPy's files, and errors.
 //!
 //! Nothing here opens a device, starts a thread or touches a file. Times are nanoseconds of `CLOCK_MONOTONIC` as
 //! `i64` (`_ns`) or microseconds as `f64` (`_us`); every name includes the unit.
@@ -13,6 +13,7 @@ mod error;
 mod film;
 mod frame;
 mod mirror;
+mod npy;
 mod pattern;
 mod pixel;
 mod raster;
@@ -36,6 +37,7 @@ pub use mirror::{
     MAX_POINTS, MechanicalDeg, Mirror, MirrorCapabilities, MirrorLimits, MirrorPath, MirrorPoint,
     MirrorProgress, OpticalDeg, PathError, RasterScan, SecondOrder, Tilt,
 };
+pub use npy::NpyHeader;
 pub use pattern::{PROJECTOR_COLUMNS, Pattern, PatternError, PatternLines};
 pub use pixel::{Mosaic, Packing, PixelError, PixelFormat, UnknownPixelFormat, UnpackLevel};
 pub use raster::{Raster, Trigger};

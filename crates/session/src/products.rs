@@ -10,10 +10,12 @@
 
 use std::fs::File;
 use std::io::{self, BufWriter};
+use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
 use ndarray::{Array2, ArrayD, ArrayRef, ArrayView2, ArrayView3, ArrayViewD, Axis, Dimension};
 use ndarray_npy::{ViewNpyExt, WritableElement, WriteNpyExt};
+use raysweep_core::{NpyHeader, io_text};
 use serde_json::{Map, Value};
 
 pub use self::video::{VideoWriter, video_tone_map};
@@ -22,6 +24,9 @@ use crate::{Error, Result, durable, exr_file, input};
 
 mod video;
 mod volume;
+
+/// Most values of an image that is read by itself: 4096 x 4096 pixels.
+const MOST_IMAGE_VALUES: usize = 1 << 24;
 
 /// The folder of the products.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -33,6 +38,12 @@ impl Products {
     /// The products in `dir`, which is created if it is missing.
     pub fn new(dir: impl Into<PathBuf>) -> Products {
         Products { dir: dir.into() }
+    }
+
+    /// Whether a product may have this name: it then needs no escaping in files and addresses.
+    pub fn is_name(name: &str) -> bool {
+        let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_');
+        !name.is_empty() && name.chars().all(plain)
     }
 
     /// The folder.
@@ -206,25 +217,6 @@ impl Products {
     /// # Errors
     /// [`Error::Io`] if it is missing or too large for the memory, [`Error::Codec`] if it is damaged.
     pub fn read_array(&self, name: &str) -> Result<ArrayD<f32>> {
-        self.with_array(name, |array| Ok(array.to_owned()))
-    }
-
-    /// Reads back image `k` of a sequence or video, `[t, s]` or `[t, s, rgb]`, and how many images there are.
-    ///
-    /// # Errors
-    /// As [`Products::read_array`], and [`Error::Shape`] if there is no such image.
-    pub fn read_image_of(&self, name: &str, k: usize) -> Result<(ArrayD<f32>, usize)> {
-        self.with_array(name, |array| match array.shape() {
-            [images, _, _, ..] if k < *images => Ok((array.index_axis(Axis(0), k).to_owned(), *images)),
-            shape => Err(Error::Shape {
-                what: format!("product `{name}`, of which image {k} is wanted, counted from 0"),
-                found: shape.to_vec(),
-                allowed: format!("[{} or more, t, s] or [.., t, s, rgb]", k.saturating_add(1)),
-            }),
-        })
-    }
-
-    fn with_array<T>(&self, name: &str, read: impl FnOnce(ArrayViewD<'_, f32>) -> Result<T>) -> Result<T> {
         let path = self.path(name, "npy")?;
         let failed = || Error::io("read", &path);
         let mut file = self.open(&path)?;
@@ -236,7 +228,51 @@ impl Products {
         aligned.resize(values, 0.0);
         let bytes: &mut [u8] = &mut bytemuck::cast_slice_mut(&mut aligned)[..length];
         io::Read::read_exact(&mut file, bytes).map_err(failed())?;
-        read(ArrayViewD::<f32>::view_npy(bytes).map_err(Error::codec("read", path.display()))?)
+        let view = ArrayViewD::<f32>::view_npy(bytes).map_err(Error::codec("read", path.display()))?;
+        Ok(view.to_owned())
+    }
+
+    /// Reads back image `k` of a sequence or video, `[t, s]` or `[t, s, rgb]`, and how many images there are. Only this
+    /// image is read.
+    ///
+    /// # Errors
+    /// As [`Products::read_array`], and [`Error::Shape`] if there is no such image, or it is too large.
+    pub fn read_image_of(&self, name: &str, k: usize) -> Result<(ArrayD<f32>, usize)> {
+        let path = self.path(name, "npy")?;
+        let damaged = |what: String| Error::codec("read", path.display())(io::Error::other(what));
+        let mut file = self.open(&path)?;
+        let length = file.metadata().map_err(Error::io("read", &path))?.len();
+        let NpyHeader { dtype, shape, data_at } =
+            NpyHeader::read(&mut file).map_err(|error| damaged(io_text(&error)))?;
+        let misfit = |allowed: String| Error::Shape {
+            what: format!("product `{name}`"),
+            found: shape.clone(),
+            allowed,
+        };
+        let ([images, size @ ..], 3..=4) = (&shape[..], shape.len()) else {
+            return Err(misfit("[k, t, s] or [k, t, s, rgb]".into()));
+        };
+        if k >= *images {
+            return Err(misfit(format!("[k, t, s] with an image {k}, counted from 0")));
+        }
+        let values = size.iter().try_fold(1_usize, |values, &axis| values.checked_mul(axis));
+        let Some(values) = values.filter(|values| *values <= MOST_IMAGE_VALUES) else {
+            return Err(misfit(format!("images of at most {MOST_IMAGE_VALUES} values")));
+        };
+        let image_bytes = (values * size_of::<f32>()) as u64;
+        let stated = image_bytes.checked_mul(*images as u64).and_then(|bytes| bytes.checked_add(data_at));
+        if dtype != "<f4" || stated != Some(length) {
+            return Err(damaged(format!(
+                "{length} bytes are not {shape:?} values of type `{dtype}`; allowed: `<f4`"
+            )));
+        }
+        let mut bytes = vec![0; values * size_of::<f32>()];
+        let at = data_at + k as u64 * image_bytes;
+        file.read_exact_at(&mut bytes, at).map_err(Error::io("read", &path))?;
+        let (numbers, _) = bytes.as_chunks();
+        let image = numbers.iter().map(|&bytes| f32::from_le_bytes(bytes)).collect();
+        let image = ArrayD::from_shape_vec(size, image).map_err(|error| damaged(error.to_string()))?;
+        Ok((image, *images))
     }
 
     /// The files of all products, by path; those of a video are in a folder of their own. Symbolic links are left out.
@@ -307,9 +343,8 @@ impl Products {
     }
 
     fn path(&self, name: &str, extension: &str) -> Result<PathBuf> {
-        let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_');
-        if name.is_empty() || !name.chars().all(plain) {
-            return Err(Error::codec("write", format!("product `{name}`"))(
+        if !Self::is_name(name) {
+            return Err(Error::codec("name", format!("product `{name}`"))(
                 "a name must have only letters, digits, `-` and `_`",
             ));
         }

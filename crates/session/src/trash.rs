@@ -24,6 +24,12 @@ impl Session {
         self.move_to(&dir, &trash)
     }
 
+    /// Whether the session is in a folder [`TRASH`].
+    pub fn is_in_trash(&self) -> bool {
+        let dir = fs::canonicalize(self.dir()).unwrap_or_else(|_| self.dir().to_owned());
+        dir.parent().is_some_and(|parent| parent.file_name().is_some_and(|name| name == TRASH))
+    }
+
     /// Moves a session back from the folder [`TRASH`]; returns its folder.
     ///
     /// # Errors

@@ -25,8 +25,8 @@ const USAGE: &str = "\
 usage: cargo xtask <command>
 
   demo               builds, runs the paper's sweep on the simulated rig, writes a report
-  test [--no-guest]  installs what the tests need, checks format, lints and tests, the guests' last;
-                     --no-guest leaves those out
+  test [--no-guest]  installs what the tests need, checks format, lints and tests, with both
+                     guests beside the tests; --no-guest leaves those out
   packages           what the tests need of Debian, what of it is missing, and how to install it
   fresh [12|13]...   runs demo and test of the last commit on a bare Debian 12 (bookworm) and 13 (trixie), or on
                      one: about 40 minutes each

@@ -178,7 +178,7 @@ pub enum Command {
     Show {
         /// The session's folder, or its name within the daemon's data folder
         session: PathBuf,
-        /// Also write a small PNG file of each picture into this folder, and list them
+        /// Also write a small PNG file of each picture, of several the first, into this folder, and list them
         #[arg(long, value_name = "FOLDER")]
         thumbnails: Option<PathBuf>,
     },

@@ -61,6 +61,7 @@ pub(super) fn calibration(
             printer.print(&Client::connect(socket)?.calibrations()?, |found| list(found))?;
         }
         CalibrationCommand::Use { session } => {
+            let session = folder_of(session, socket)?;
             // The daemon's working directory is another: what exists here is named in full.
             let session = std::fs::canonicalize(&session).unwrap_or(session);
             Client::connect(socket)?.use_calibration(&session)?;

@@ -403,7 +403,7 @@ impl Proposed {
         }
         if *headroom > WORTHWHILE {
             head.push(format!(
-                "the scene may be {headroom:.2} times as bright, as long as a white board has at most 65 % of full scale, which a calibration needs: open the aperture, or raise the gain, calibrate, and try again"
+                "the scene may be {headroom:.2} times as bright, as long as a white board has at most 65 % of full scale, which a calibration needs: open the aperture, or raise the gain, calibrate again, and try this again"
             ));
         }
         if let Some(average) = average {

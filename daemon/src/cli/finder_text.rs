@@ -33,11 +33,20 @@ pub(super) fn line(values: &ViewfinderValues) -> String {
     line
 }
 
+/// A number of so many steps in one, so that what is printed as zero is not negative.
+fn rounded(value: f64, steps: f64) -> f64 {
+    (value * steps).round() / steps + 0.0
+}
+
 /// How the rows lie, and what to turn, in lines.
 pub(super) fn alignment(found: &RowAlignment) -> String {
     let mut text = format!(
         "rows: shift {:+.2} rows, rotation {:+.3} degrees, magnification {:.4}; at most {:.2} rows off, {:.2} rms unexplained",
-        found.shift_rows, found.rotation_deg, found.magnification, found.worst_rows, found.residual_rows
+        rounded(found.shift_rows, 100.0),
+        rounded(found.rotation_deg, 1000.0),
+        found.magnification,
+        found.worst_rows,
+        found.residual_rows
     );
     match found.advice.is_empty() {
         true => text.push_str("\n  aligned to a tenth of a row"),

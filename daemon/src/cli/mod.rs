@@ -134,6 +134,7 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
                     }
                 },
             };
+            let session = folder_of(session, &socket)?;
             // The daemon's working directory is another: what exists here is named in full.
             let session = fs::canonicalize(&session).unwrap_or(session);
             return begin_run(&socket, printer, detach, Interrupts::of_operator, |client| {

@@ -136,7 +136,8 @@ impl SessionView {
             in_products
                 .iter()
                 .filter(|path| path.extension().is_some_and(|found| found == ending))
-                .cloned()
+                // JSON has no other names than UTF-8.
+                .map(|path| path.to_string_lossy().into_owned().into())
                 .collect()
         };
         let report = session.report_path();

@@ -127,19 +127,19 @@ fn mirror(mirror: &MirrorStatus) -> String {
 
 /// What `check` says: rows of a word and a text, and tables of settings with what they are.
 #[derive(Serialize)]
-pub(super) struct Checked {
+pub(super) struct CheckText {
     rows: Vec<(&'static str, String)>,
     tables: Vec<(&'static str, String)>,
 }
 
 /// Text of `check`.
 pub(super) fn check(report: &CheckReport) -> String {
-    let Checked { rows, tables } = checked(report);
+    let CheckText { rows, tables } = check_text(report);
     tables.iter().fold(block(&rows), |text, (what, table)| format!("{text}\n\n# {what}\n{table}"))
 }
 
 /// What `check` says, for the terminal and the page.
-pub(super) fn checked(report: &CheckReport) -> Checked {
+pub(super) fn check_text(report: &CheckReport) -> CheckText {
     let mut rows = vec![
         (
             "points",
@@ -225,7 +225,7 @@ pub(super) fn checked(report: &CheckReport) -> Checked {
     let chosen = report.settings.iter().map(|table| ("the settings that are taken", table));
     let tables = chosen.chain(better.map(|better| ("better settings", &better.table)));
     let tables = tables.map(|(what, table)| (what, table.trim_end().to_owned())).collect();
-    Checked { rows, tables }
+    CheckText { rows, tables }
 }
 
 /// Expected errors and advice of `check`; the better settings' tables follow the rows.

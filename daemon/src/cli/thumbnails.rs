@@ -4,8 +4,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use ndarray::{ArrayD, Axis, Ix3};
+use raysweep_session::products::Products;
 use raysweep_session::report::{Picture, ToneMap};
-use raysweep_session::{Session, input};
+use raysweep_session::{Error, Session, input};
 use serde_json::Value;
 
 use super::failure::CommandFailure;
@@ -13,8 +14,6 @@ use super::picture_file;
 
 /// Largest picture, in bytes: 4096 x 4096 values and the header of their file.
 const MOST_PICTURE_BYTES: u64 = (4 << 24) + (1 << 16);
-/// Largest sequence or video, in bytes: it is read whole for one image of it.
-const MOST_VIDEO_BYTES: u64 = 1 << 28;
 /// Largest description of a product.
 const MOST_ABOUT_BYTES: u64 = 1 << 24;
 /// Pictures that say most of a session, best first.
@@ -34,6 +33,7 @@ pub(super) fn pictures(session: &Session) -> Vec<String> {
             path.metadata().is_ok_and(|it| it.is_file() && most.is_some_and(|most| it.len() <= most))
         })
         .filter_map(|path| Some(path.file_stem()?.to_str()?.to_owned()))
+        .filter(|name| Products::is_name(name))
         .collect();
     names.sort();
     names.sort_by_key(|name| BEST.iter().position(|best| best == name).unwrap_or(BEST.len()));
@@ -51,7 +51,8 @@ fn most_bytes(about: &Value) -> Option<u64> {
     let axes: Vec<&str> = about["axes"].as_array()?.iter().filter_map(Value::as_str).collect();
     match axes[..] {
         ["t", "s"] | ["t", "s", "rgb"] => Some(MOST_PICTURE_BYTES),
-        ["k", "t", "s"] | ["k", "t", "s", "rgb"] => Some(MOST_VIDEO_BYTES),
+        // One image is read at a time.
+        ["k", "t", "s"] | ["k", "t", "s", "rgb"] => Some(u64::MAX),
         _ => None,
     }
 }
@@ -59,35 +60,44 @@ fn most_bytes(about: &Value) -> Option<u64> {
 /// Image `k` of a product, `[t, s]` or `[t, s, rgb]`, and how many it has; a picture has one.
 ///
 /// # Errors
-/// If its file cannot be read, or there is no such image.
+/// If its file cannot be read, holds no pictures, or there is no such image.
 pub(super) fn image(
     session: &Session,
     name: &str,
     k: usize,
 ) -> raysweep_session::Result<(ArrayD<f32>, usize)> {
     let products = session.products();
-    match about(&products.dir().join(format!("{name}.npy")))["axes"][0] == "k" {
-        true => products.read_image_of(name, k),
-        false => Ok((products.read_array(name)?, 1)),
+    let is_several = about(&products.dir().join(format!("{name}.npy")))["axes"][0] == "k";
+    let (image, of) = match is_several {
+        true => products.read_image_of(name, k)?,
+        false => (products.read_array(name)?, 1),
+    };
+    // The dimensions in the file may contradict the names of the axes beside it.
+    match image.shape() {
+        [_, _] | [_, _, 3] if !image.is_empty() && k < of => Ok((image, of)),
+        shape => Err(Error::Shape {
+            what: format!("picture {k} of product `{name}`, counted from 0 of {of},"),
+            found: shape.to_vec(),
+            allowed: "[t, s] or [t, s, 3], not empty, and a picture that there is".into(),
+        }),
     }
 }
 
-/// A picture of a session, or the first of several, as a small PNG file, with its own white; `None` if its file holds no
-/// picture.
+/// A picture of a session, or the first of several, as a small PNG file, with its own white.
 ///
 /// # Errors
-/// If the file cannot be read.
-pub(super) fn small(session: &Session, name: &str) -> raysweep_session::Result<Option<Vec<u8>>> {
+/// As [`image`].
+pub(super) fn small(session: &Session, name: &str) -> raysweep_session::Result<Vec<u8>> {
     let (image, _) = image(session, name, 0)?;
     let image = if image.ndim() == 2 { image.insert_axis(Axis(2)) } else { image };
-    // The dimensions in the file may contradict the names of the axes beside it.
-    let Ok(image) = image.into_dimensionality::<Ix3>() else { return Ok(None) };
+    let image = image.into_dimensionality::<Ix3>().map_err(|error| Error::Codec {
+        action: "draw",
+        what: format!("product `{name}`"),
+        why: error.to_string(),
+    })?;
     let planes: Vec<_> = image.axis_iter(Axis(2)).collect();
-    if ![1, 3].contains(&planes.len()) || image.is_empty() {
-        return Ok(None);
-    }
     let white = ToneMap::percentile(&planes, WHITE_PERCENT);
-    Picture::small(image.view(), white).to_png().map(Some)
+    Picture::small(image.view(), white).to_png()
 }
 
 /// Writes a small PNG file of each picture of a session into `folder`; returns their paths. What cannot be read is left out:
@@ -102,7 +112,7 @@ pub(super) fn write(session: &Session, folder: &Path) -> Result<Vec<PathBuf>, Co
     fs::create_dir_all(folder).map_err(|source| CommandFailure::Write { path: folder.to_owned(), source })?;
     let mut written = Vec::new();
     for (name, path) in paths {
-        let Ok(Some(png)) = small(session, &name) else { continue };
+        let Ok(png) = small(session, &name) else { continue };
         picture_file::write(&path, &png)?;
         written.push(path);
     }

@@ -134,9 +134,9 @@ impl<'a> RigOfRun<'a> {
     }
 }
 
-/// What a run finds, in a sentence each, that a calibration may have served.
-pub fn found_of_calibration(is_calibrated: bool) -> Vec<String> {
-    let said = "not calibrated: times and levels are those of the rig file, and errors may be many times larger than foreseen; `raysweep calibrate` measures them";
+/// What a run says at its end if it had no calibration.
+pub fn notice_if_uncalibrated(is_calibrated: bool) -> Vec<String> {
+    let said = "not calibrated: times and levels are those of the rig file, and errors may be many times larger than foreseen; `raysweep calibrate` measures these times and levels";
     if is_calibrated { Vec::new() } else { vec![said.to_owned()] }
 }
 

@@ -90,7 +90,7 @@ impl ViewfinderPlan {
     pub(super) fn check(&self, document: &mut Document<'_>) {
         let [x_deg, y_deg] = self.tilt_deg;
         let rules = [
-            ("exposure_us", self.exposure_us.unwrap_or(1.0), 0.1..=1e6),
+            ("exposure_us", self.exposure_us.unwrap_or(1.0), 0.01..=1e6),
             ("pictures_per_s", self.pictures_per_s, 0.1..=30.0),
             ("seconds", self.seconds.unwrap_or(1.0), 0.1..=86_400.0),
             ("tilt_deg", if x_deg.abs() > y_deg.abs() { x_deg } else { y_deg }, -45.0..=45.0),

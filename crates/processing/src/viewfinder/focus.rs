@@ -226,4 +226,31 @@ mod tests {
         let small = Array2::from_elem((2, 64), 100);
         assert_eq!((add(&mut meter, &small), add(&mut meter, &small)), (None, None));
     }
+
+    /// Sobel's operator as it is defined, pixel by pixel, on a part of an image, with the neighbours of both steps.
+    #[test]
+    fn the_score_is_that_of_the_definition() {
+        const KERNEL: [[f64; 3]; 3] = [[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0], [-1.0, 0.0, 1.0]];
+        let mut random = Xoshiro256PlusPlus::seed_from_u64(3);
+        let mut picture = || Array2::from_shape_fn((23, 31), |_| (random.next_u64() >> 48) as u16);
+        let pictures = [picture(), picture()];
+        for step in [1, 2] {
+            let part = |picture: &Array2<u16>| picture.slice(ndarray::s![2..20, 3..29]).to_owned();
+            let [one, other] = [part(&pictures[0]), part(&pictures[1])];
+            let gradient = |image: &Array2<u16>, t: usize, s: usize, is_down: bool| -> f64 {
+                let of = |a: usize, b: usize| f64::from(image[[t + a * step, s + b * step]]);
+                let weight = |a: usize, b: usize| if is_down { KERNEL[b][a] } else { KERNEL[a][b] };
+                (0..9).map(|at| weight(at / 3, at % 3) * of(at / 3, at % 3)).sum()
+            };
+            let (rows, columns) = (18 - 2 * step, 26 - 2 * step);
+            let pixels = (0..rows).flat_map(|t| (0..columns).map(move |s| (t, s)));
+            let products = pixels.flat_map(|(t, s)| [false, true].map(|is_down| (t, s, is_down)));
+            let sum: f64 =
+                products.map(|(t, s, d)| gradient(&one, t, s, d) * gradient(&other, t, s, d)).sum();
+            let expected = sum / (rows * columns) as f64;
+            let regions = [&pictures[0], &pictures[1]].map(|it| it.slice(ndarray::s![2..20, 3..29]));
+            let found = mean_product(regions[0], regions[1], step);
+            assert!((found / expected - 1.0).abs() < 1e-4, "step {step}: {found} for {expected}");
+        }
+    }
 }

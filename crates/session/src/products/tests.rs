@@ -73,9 +73,15 @@ fn a_sequence_has_a_layer_for_each_image() {
         (values.index_axis(Axis(0), 2).to_owned().into_dyn(), 3)
     );
     let beyond = products.read_image_of("line", 3).unwrap_err().to_string();
-    assert!(beyond.contains("image 3") && beyond.contains("[4 or more, t, s]"), "{beyond}");
+    assert!(beyond.contains("image 3, counted from 0") && beyond.contains("[3, 5, 4]"), "{beyond}");
     products.image("single", values.index_axis(Axis(0), 0), &metadata()).unwrap();
     assert!(matches!(products.read_image_of("single", 0), Err(Error::Shape { .. })));
+    // A colour image, from a file that holds a multiple of it.
+    let colour =
+        ndarray::Array4::from_shape_fn((2, 3, 4, 3), |(k, t, s, c)| (1000 * k + 100 * t + 10 * s + c) as f32);
+    ndarray_npy::write_npy(products.dir().join("colour.npy"), &colour).unwrap();
+    let second = colour.index_axis(Axis(0), 1).to_owned().into_dyn();
+    assert_eq!(products.read_image_of("colour", 1).unwrap(), (second, 2));
     let short = products.sequence("line", values.view(), &layers[..2], &metadata());
     assert!(matches!(short, Err(Error::Shape { .. })));
 }
@@ -192,4 +198,34 @@ fn a_damaged_image_is_an_error() {
     let huge = [b"\x93NUMPY\x01\x00\x76\x00", format!("{claim:<117}\n").as_bytes(), &bytes[128..]].concat();
     fs::write(&path, huge).unwrap();
     assert!(matches!(products.read_image("epipolar"), Err(Error::Codec { .. })));
+}
+
+#[test]
+fn an_image_of_a_damaged_sequence_is_refused_before_memory_is_taken_for_it() {
+    let (_dir, products) = products();
+    let path = products.dir().join("line.npy");
+    products.volume("line", Array3::zeros((3, 5, 4)).view(), &metadata()).unwrap();
+    let whole = fs::read(&path).unwrap();
+    let damaged = |bytes: &[u8]| {
+        fs::write(&path, bytes).unwrap();
+        products.read_image_of("line", 1).unwrap_err().to_string()
+    };
+    let claims = |what: &str, instead: &str| {
+        let text = String::from_utf8_lossy(&whole[..128]).replace(what, instead);
+        let padded = format!("{:127}\n", text.trim_end().trim_start_matches('\u{fffd}'));
+        [&whole[..1], &padded.as_bytes()[..127], &whole[128..]].concat()
+    };
+    for (bytes, expected) in [
+        (whole[..whole.len() - 1].to_vec(), "bytes are not"),
+        ([&whole[..], &[0]].concat(), "bytes are not"),
+        (claims("(3, 5, 4)", "(3, 99999, 99999)"), "values"),
+        (claims("(3, 5, 4)", "(3, 4294967296, 4294967296)"), "values"),
+        (claims("(3, 5, 4)", "(20, 3)"), "[k, t, s]"),
+        (claims("<f4", "<f8"), "`<f8`"),
+        (whole[..60].to_vec(), "line.npy"),
+        (Vec::new(), "line.npy"),
+    ] {
+        let said = damaged(&bytes);
+        assert!(said.contains(expected), "{expected}: {said}");
+    }
 }

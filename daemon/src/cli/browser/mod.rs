@@ -174,8 +174,8 @@ struct Call {
     params: Map<String, Value>,
 }
 
-/// Carries out a call of the daemon: `{"result": ..., "shown": ...}` or `{"error": {"code": ..., "message": ...}}`. What
-/// is shown are the rows and tables of `check`, or why the files of `sessions` may not be read.
+/// Carries out a call of the daemon: `{"result": ...}` or `{"error": {"code": ..., "message": ...}}`, with `checked`, the
+/// rows and tables of `check`, or `barred`, why the files of `sessions` may not be read.
 async fn call(State(view): State<Arc<View>>, body: Bytes) -> Response {
     let call: Call = match serde_json::from_slice(&body) {
         Ok(call) => call,
@@ -188,20 +188,22 @@ async fn call(State(view): State<Arc<View>>, body: Bytes) -> Response {
     let answer = spawn_blocking(move || {
         let _turn = turn;
         let result: Value = Client::connect(&socket)?.call(method, &call.params)?;
-        let shown = match method {
+        Ok::<_, ClientError>(match method {
             Method::Check => {
-                serde_json::from_value(result.clone()).ok().map(|report| json!(show::checked(&report)))
+                let checked =
+                    serde_json::from_value(result.clone()).ok().map(|report| show::check_text(&report));
+                json!({ "result": result, "checked": checked })
             }
             Method::Sessions => {
                 let newest = result.as_array().and_then(|sessions| sessions.last()?["session"].as_str());
-                newest.and_then(|session| barred(Path::new(session))).map(Value::from)
+                let barred = newest.and_then(|session| barred(Path::new(session)));
+                json!({ "result": result, "barred": barred })
             }
-            _ => None,
-        };
-        Ok::<_, ClientError>((result, shown))
+            _ => json!({ "result": result }),
+        })
     });
     match answer.await {
-        Ok(Ok((result, shown))) => Json(json!({ "result": result, "shown": shown })).into_response(),
+        Ok(Ok(told)) => Json(told).into_response(),
         Ok(Err(ClientError::Rpc(error))) => Json(json!({ "error": error })).into_response(),
         Ok(Err(error)) => Json(json!({ "error": { "message": error.to_string() } })).into_response(),
         Err(_) => {

@@ -36,7 +36,8 @@ impl Encoded {
     pub fn new(image: ArrayViewD<'_, f32>, mut about: Value) -> Self {
         let largest =
             image.iter().filter(|value| value.is_finite()).fold(0.0_f32, |most, value| most.max(value.abs()));
-        let scale = if largest > 0.0 { largest / LARGEST } else { 1.0 };
+        // Where the smallest numbers end, all that is smaller is 0.
+        let scale = if largest > 0.0 { (largest / LARGEST).max(f32::MIN_POSITIVE) } else { 1.0 };
         about["shape"] = json!(image.shape());
         about["scale"] = json!(scale);
         let mut head = about.to_string().into_bytes();
@@ -88,6 +89,8 @@ mod tests {
 
     #[test]
     fn a_picture_is_a_header_and_halves_that_give_the_values_back() {
+        let Encoded(tiny) = Encoded::new(array![[1e-44_f32]].into_dyn().view(), json!({}));
+        assert!(!String::from_utf8_lossy(&tiny).contains("\"scale\":0.0"), "nothing divides by zero");
         let image = array![[0.0_f32, -2500.0, 1e-3], [f32::NAN, 100.0, 2047.5]].into_dyn();
         let Encoded(bytes) = Encoded::new(image.view(), json!({ "name": "epipolar" }));
         let length = u32::from_le_bytes(bytes[..4].try_into().unwrap()) as usize;

@@ -61,7 +61,7 @@ pub(super) fn picture(folder: &Path, product: &str, k: usize) -> Result<Encoded,
 pub(super) fn thumbnail(folder: &Path) -> Result<Option<Vec<u8>>, String> {
     let session = Session::open(folder).map_err(told)?;
     let best = pictures(&session).into_iter().next();
-    best.map_or(Ok(None), |name| small(&session, &name)).map_err(told)
+    best.map(|name| small(&session, &name)).transpose().map_err(told)
 }
 
 /// Light from each relative projector row u to a pixel, with the first u.

@@ -27,7 +27,7 @@ use self::worker::{Account, Solving, Worker};
 use crate::devices::camera::{Exposures, FilmSetting};
 use crate::plane::advice::{advise, design};
 use crate::plane::{Opened, PointSink, Taken, missing};
-use crate::procedure::lab::{Lab, RigOfRun, found_of_calibration, keep_calibration};
+use crate::procedure::lab::{Lab, RigOfRun, keep_calibration, notice_if_uncalibrated};
 use crate::rig::{Pace, Rig};
 use crate::run::error::RunError;
 use crate::run::life::{Ended, Foreseen, Measurement, Run, end_state};
@@ -259,5 +259,5 @@ fn conclude(acquired: Acquired, run: &FilmRun, orders: &Orders) -> Result<Ended,
         write_report(&session, ledger.state(), film, &made, &problems)?;
         manifest::write(&session, ledger.state(), &film.task, &rig.file)?;
     }
-    Ok(Ended { end, found: found_of_calibration(film.task.calibration_made.is_some()) })
+    Ok(Ended { end, found: notice_if_uncalibrated(film.task.calibration_made.is_some()) })
 }

@@ -16,7 +16,7 @@ use raysweep_session::ledger::{EndEntry, EndState, Entry};
 use raysweep_session::stack::StackShape;
 
 use crate::plane::{Opened, Passes, PointSink, Taken, is_any_lit, missing, regular_again};
-use crate::procedure::lab::{Lab, RigOfRun, found_of_calibration, keep_calibration};
+use crate::procedure::lab::{Lab, RigOfRun, keep_calibration, notice_if_uncalibrated};
 use crate::rig::Rig;
 use crate::run::error::RunError;
 use crate::run::life::{Ended, Foreseen, Measurement, Run, end_state};
@@ -102,7 +102,7 @@ impl Measurement for PatternsRun {
         if let Some(products) = products {
             products.write_report(&session, ledger.state(), &patterns, &rig.file)?;
         }
-        Ok(Ended { end, found: found_of_calibration(task.calibration_made.is_some()) })
+        Ok(Ended { end, found: notice_if_uncalibrated(task.calibration_made.is_some()) })
     }
 }
 

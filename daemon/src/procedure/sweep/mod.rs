@@ -22,7 +22,7 @@ use crate::devices::camera::Exposures;
 use crate::live::{LiveEstimate, Outlet};
 use crate::plane::advice::{advise, design};
 use crate::plane::{Opened, Passes, PointSink, Taken, is_any_lit, missing, regular_again};
-use crate::procedure::lab::{Lab, RigOfRun, found_of_calibration, keep_calibration};
+use crate::procedure::lab::{Lab, RigOfRun, keep_calibration, notice_if_uncalibrated};
 use crate::rig::Rig;
 use crate::run::error::RunError;
 use crate::run::life::{Ended, Foreseen, Measurement, Run, end_state};
@@ -246,7 +246,7 @@ fn conclude(
     } else {
         ledger.append(&Entry::End(end.clone()))?;
     }
-    Ok(Ended { end, found: found_of_calibration(task.calibration_made.is_some()) })
+    Ok(Ended { end, found: notice_if_uncalibrated(task.calibration_made.is_some()) })
 }
 
 /// Publishes the result where the earlier estimates were published.

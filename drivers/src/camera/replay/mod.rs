@@ -1,7 +1,6 @@
 //! A camera that plays back recorded frames: high-speed cameras record into their own memory first and are downloaded
 //! later.
 
-mod npy;
 mod recording;
 
 use std::time::{Duration, Instant};

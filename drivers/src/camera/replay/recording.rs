@@ -5,9 +5,8 @@ use std::io::{self, BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use png::{BitDepth, ColorType};
-use raysweep_core::{DeviceError, DeviceErrorKind, Packing, PixelFormat};
+use raysweep_core::{DeviceError, DeviceErrorKind, NpyHeader, Packing, PixelFormat};
 
-use super::npy::NpyHeader;
 use raysweep_config::rig::replay::{RawPacking, ReplayConfig};
 
 /// Format of the files of a recording.

@@ -5,6 +5,11 @@ import { element, number, pairs } from "./picture.js";
 import { line, plotIn } from "./plots.js";
 
 const PICTURES = ["white", "black", "grid", "rows", "cross", "align"];
+/** With its sign, unless it is shown as zero. */
+const signed = (value, digits) => {
+  const shown = value.toFixed(digits);
+  return Number(shown) === 0 ? (0).toFixed(digits) : `${value > 0 ? "+" : ""}${shown}`;
+};
 const percent = (share) => `${(100 * share).toFixed(share < 0.001 ? 3 : 1)} %`;
 
 /** Plots of the counts along a row and a column. */
@@ -56,8 +61,8 @@ export function showFinder(values) {
   rows.push(["saturated", percent(values.saturated)], ["nearly dark", percent(values.underexposed)],
     ["mean", `${number(values.mean_dn)} of ${values.full_dn} counts`], ["brightest", `${values.brightest_dn} counts`]);
   if (alignment) {
-    rows.push(["shift", `${alignment.shift_rows.toFixed(2)} rows`],
-      ["rotation", `${alignment.rotation_deg.toFixed(3)}°`],
+    rows.push(["shift", `${signed(alignment.shift_rows, 2)} rows`],
+      ["rotation", `${signed(alignment.rotation_deg, 3)}°`],
       ["magnification", alignment.magnification.toFixed(4)],
       ["farthest off", `${alignment.worst_rows.toFixed(2)} rows`]);
   }

@@ -6,7 +6,7 @@ import { startSessions } from "./sessions.js";
 
 export const by = (id) => document.getElementById(id);
 
-/** Calls a method of the daemon; {result, shown} or {error}. */
+/** Calls a method of the daemon; {result}, with what `raysweep view` adds to it, or {error}. */
 export async function call(method, params = {}) {
   try {
     const answer = await fetch("call", {

@@ -11,12 +11,13 @@ const LINES = [["#0b62a8", "#6cb4f0"], ["#b35c00", "#e8b75a"], ["#2d7d46", "#7fc
 export const line = (at, label, options = {}) =>
   ({ label, stroke: () => LINES[at % LINES.length][+isDark()], width: 1.5, points: { show: false }, ...options });
 
-/** Plots lines over x; `x` and `y` are the axes' labels, if they need any. */
+/** Plots lines over x, until its place is removed; `x` and `y` are the axes' labels, if they need any. */
 export function plotIn(place, { x, y, lines, height = 220, legend = false, range = null }, data) {
   const [stroke, grid] = [axisColour, { stroke: gridColour, width: 1 }];
   const axis = (label, size) => ({ label, labelSize: 20, size, stroke, grid, ticks: { ...grid, size: 4 } });
   const watch = new ResizeObserver(() => {
-    if (place.clientWidth) plot.setSize({ width: place.clientWidth, height });
+    if (!place.isConnected) plot.destroy();
+    else if (place.clientWidth) plot.setSize({ width: place.clientWidth, height });
   });
   const plot = new uPlot({
     width: place.clientWidth, height, legend: { show: legend },

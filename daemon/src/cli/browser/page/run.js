@@ -26,6 +26,10 @@ const nameOf = (folder) => folder?.split("/").pop();
 let status = {};
 /** What was last asked; at the end of a run nothing waits for it. */
 let asked = null;
+/** What the last run found. */
+let found = [];
+/** Says of what the live picture is; it depends on the run, too. */
+let tellAbout = () => {};
 /** Why the last order was refused, until the next one. */
 let complaint = null;
 /** Jitter since the page was opened: seconds, standard deviation, 99th percentile. */
@@ -66,7 +70,7 @@ function hear(event) {
     case "viewfinder": showFinder(event); break;
     case "state":
       status.state = event.state;
-      if (["preparing", "running"].includes(event.state)) asked = null;
+      if (["preparing", "running"].includes(event.state)) [asked, found] = [null, []];
       draw();
       refresh();
       break;
@@ -75,7 +79,10 @@ function hear(event) {
       if (!event.wants_answer) asked = event.text;
       refresh();
       break;
-    case "finished": refresh(); break;
+    case "finished":
+      found = event.found ?? [];
+      refresh();
+      break;
   }
 }
 
@@ -148,6 +155,7 @@ function draw() {
   if (status.error) notes.push(note("bad", status.error));
   if (status.ended && asked) notes.push(note("warn", asked));
   notes.push(...(status.warnings ?? []).map((warning) => note("warn", warning)));
+  if (status.ended) notes.push(...found.map((what) => note("", what)));
   if (status.ended === "complete" && session && stores) {
     const href = `session/${encodeURIComponent(nameOf(session))}/report`;
     notes.push(element("p", {}, element("a", { href, target: "_blank", rel: "noopener" }, "Open the report")));
@@ -155,6 +163,7 @@ function draw() {
     notes.push(note("warn", "What it has stored is among the sessions, with a button that resumes it if it can be."));
   }
   by("notes").replaceChildren(...notes);
+  tellAbout();
 }
 
 function tellVsync(vsync) {
@@ -175,9 +184,10 @@ function addJitter(vsync) {
 
 async function check() {
   tellChecked(element("p", { class: "quiet" }, "checking …"));
-  const { error, shown } = await call("check", { plan: by("plan").value });
+  const { error, checked } = await call("check", { plan: by("plan").value });
   if (error) tellChecked(...mistakes(error));
-  else tellChecked(element("dl", { class: "figures" }, ...pairs(shown.rows)), ...shown.tables.flatMap(([what, table]) =>
+  else if (!checked) tellChecked(note("bad", "The daemon has another version: start `raysweep view` again."));
+  else tellChecked(element("dl", { class: "figures" }, ...pairs(checked.rows)), ...checked.tables.flatMap(([what, table]) =>
     [element("h3", {}, what), element("pre", {}, table)]));
 }
 
@@ -241,7 +251,7 @@ async function watchPictures({ onregion, onmarks }) {
     }
   };
   /** What is shown, and whether it is of an earlier run: the file keeps the newest picture of each name. */
-  const tellAbout = () => {
+  tellAbout = () => {
     if (!shown) return;
     const session = nameOf(shown.about.session);
     const isOld = UNDER_WAY.includes(status.state) && session !== nameOf(status.session);

@@ -28,7 +28,7 @@ export function startSessions({ watch }) {
 
   async function list() {
     // Why the sessions' files may not be read, if so.
-    const { result, error, shown: barred } = await call("sessions");
+    const { result, error, barred } = await call("sessions");
     const notes = [error?.message, barred && `What sessions contain is not shown: ${barred}.`];
     by("sessions-notes").replaceChildren(...notes.filter(Boolean).map((why) => note("warn", why)));
     if (!result) return;
@@ -106,6 +106,7 @@ export function startSessions({ watch }) {
       const draw = pictures({ sides, menu, slider, which, choice }, [first, second], pixel);
       menu.addEventListener("change", () => {
         slider.value = 0;
+        choice.hidden = true;
         draw();
       });
       slider.addEventListener("input", draw);
@@ -170,26 +171,26 @@ function joined(one, two) {
 function pictures({ sides, menu, slider, which, choice }, [first, second], onpixel) {
   // Zoom, colours and limits stay from image to image of a product.
   let [views, product] = [[], null];
-  return async () => {
-    const [name, k] = [menu.value, slider.value];
+  const look = async (name, k) => {
     const of = (session) => fetchPicture(address(session, `/picture/${encodeURIComponent(name)}?k=${k}`));
     const [one, two] = await Promise.all([of(first), second && of(second)]);
-    // Another was chosen meanwhile.
-    if (name !== menu.value || k !== slider.value) return;
     const count = Math.min(one.of, two ? two.of : one.of);
     slider.max = count - 1;
     choice.hidden = count < 2;
-    which.textContent = `${Number(k) + 1} of ${count}`;
-    const shown = two ? compared(one, two, [first, second]) : [{ title: name, picture: one }];
+    const at = one.about?.k?.at?.[k];
+    which.textContent = `${k + 1} of ${count}${at == null ? "" : `: ${one.about.k.is.replaceAll("_", " ")} ${at}`}`;
+    const shown = two ? compared(one, two, [first, second]) : [{ title: name, label: name, picture: one }];
     if (product !== name) {
       sides.replaceChildren();
-      views = shown.map(({ title, picture, ...options }) => {
+      views = shown.map(({ title, label, picture, ...options }) => {
         const [box, heading] = [element("div"), element("h3")];
         box.append(heading);
         sides.append(box);
-        const view = new Picture(box, { label: `${name} of ${title}`, onpixel, ...options });
-        return Object.assign(view, { heading });
+        return Object.assign(new Picture(box, { label: `${name} of ${label}`, onpixel, ...options }), { heading });
       });
+      if (two && shown.length < 3) {
+        sides.append(note("warn", "The pictures differ in size, so there is no difference to show."));
+      }
       product = name;
     }
     for (const [at, { title, picture, range }] of shown.entries()) {
@@ -197,22 +198,36 @@ function pictures({ sides, menu, slider, which, choice }, [first, second], onpix
       views[at].range = range;
       views[at].show(picture);
     }
-    if (two && shown.length < 3 && sides.children.length < 3) {
-      sides.append(note("warn", "The pictures differ in size, so there is no difference to show."));
+  };
+  let [wanted, busy] = [false, false];
+  return async () => {
+    wanted = true;
+    if (busy) return;
+    busy = true;
+    while (wanted) {
+      wanted = false;
+      try {
+        await look(menu.value, Number(slider.value));
+      } catch (error) {
+        sides.replaceChildren(note("bad", error.message));
+        [choice.hidden, product] = [true, null];
+      }
     }
+    busy = false;
   };
 }
 
 /** Two pictures, in which the same light has the same brightness, and their difference if they are of one size. */
 function compared(one, two, [first, second]) {
   const range = joined(one.values, two.values);
-  const sides = [{ title: first, picture: one, range }, { title: second, picture: two, range }];
+  const sides = [[first, one], [second, two]].map(([label, picture]) => ({ title: label, label, picture, range }));
   if (one.shape.join() !== two.shape.join()) return sides;
   const values = one.values.map((value, at) => two.values[at] - value);
   const square = (value) => (Number.isFinite(value) ? value * value : 0);
   const rms = Math.sqrt(values.reduce((sum, value) => sum + square(value), 0) / values.length);
   const title = `second − first, RMS ${number(rms)}`;
-  return [...sides, { title, picture: { ...one, values }, colours: "difference", symmetric: true }];
+  const label = "the difference, second − first";
+  return [...sides, { title, label, picture: { ...one, values }, colours: "difference", symmetric: true }];
 }
 
 /** Profiles over u, `{u_min, light}`, on the u that any of them has: `[u, light, ...]`, null where one has none. */
