@@ -127,13 +127,14 @@ fn arv_camera_test_streams_without_loss() {
     );
     let completed = figure(&report, "n_completed_buffers");
     assert!(completed > 0, "{report}");
-    for name in
-        ["n_failures", "n_missing_frames", "n_missing_packets", "n_error_packets", "n_size_mismatch_errors"]
-    {
+    for name in ["n_failures", "n_missing_frames", "n_missing_packets", "n_error_packets"] {
         assert_eq!(figure(&report, name), 0, "{name}: {report}");
     }
-    // On a busy machine the tool is late with its buffers and skips packets, which it does not count as frames. Frames
-    // in transit when it stops are not counted at all.
+    // On a busy machine the tool is late with its buffers and skips packets, which it does not count as frames; what it
+    // has of a frame is then too short. Frames in transit when it stops are not counted at all.
+    let (mismatches, ignored) =
+        (figure(&report, "n_size_mismatch_errors"), figure(&report, "n_ignored_packets"));
+    assert!(mismatches == 0 || ignored > 0, "{report}");
     let truth = camera.truth();
     assert!(completed <= truth.frames, "{truth:?} {report}");
     assert!(figure(&report, "n_received_packets") * 2 > truth.packets, "{truth:?} {report}");

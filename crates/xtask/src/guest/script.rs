@@ -3,7 +3,7 @@
 use super::table::{GuestTest, ports};
 
 /// Time limit for a test; a test that takes longer counts as hung.
-pub const TEST_LIMIT_S: u32 = 120;
+pub const TEST_LIMIT_S: u32 = 300;
 
 /// Links the ports to their names; one after another, they come a while after the module.
 const PREFACE: &str = "\
