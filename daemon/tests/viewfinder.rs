@@ -425,6 +425,16 @@ impl Program {
         self.command(arguments).output().unwrap()
     }
 
+    /// What `expose` proposes for the plan, the exposure of it, and the rig.
+    fn expose(&self) -> (serde_json::Value, f64, Rig) {
+        let output = self.raysweep(&["--json", "expose", "plan.toml"]);
+        let said = String::from_utf8(output.stdout).unwrap();
+        assert!(output.status.success(), "{said} {}", String::from_utf8_lossy(&output.stderr));
+        let proposed: serde_json::Value = serde_json::from_str(&said).unwrap();
+        let exposure_us = proposed["exposure_us"].as_f64().unwrap();
+        (proposed, exposure_us, Rig::load(&self.folder.path().join("rig.toml")).unwrap())
+    }
+
     fn plan(&self, text: &str) {
         std::fs::write(self.folder.path().join("plan.toml"), text).unwrap();
     }
@@ -453,12 +463,7 @@ fn brute_force(rig: &Rig, delay_us: f64, exposure_us: f64) -> (f64, f64) {
 fn the_proposed_exposure_saturates_nothing_and_is_as_good_as_the_best_of_all() {
     let program = Program::start(BRIGHT);
     program.plan("kind = \"sweep\"\nname = \"mine\"\n[sweep]\ndelay_us = [-300, 0, 300]\nexposure_us = [100, 1000, 15000]\n");
-    let output = program.raysweep(&["--json", "expose", "plan.toml"]);
-    let said = String::from_utf8(output.stdout).unwrap();
-    assert!(output.status.success(), "{said} {}", String::from_utf8_lossy(&output.stderr));
-    let proposed: serde_json::Value = serde_json::from_str(&said).unwrap();
-    let exposure_us = proposed["exposure_us"].as_f64().unwrap();
-    let rig = Rig::load(&program.folder.path().join("rig.toml")).unwrap();
+    let (proposed, exposure_us, rig) = program.expose();
     let (_, ratio) = brute_force(&rig, 0.0, exposure_us);
     let best = (0..=100)
         .map(|step| 100.0 * 150_f64.powf(f64::from(step) / 100.0))
@@ -507,12 +512,7 @@ fn the_proposed_exposure_suits_the_delay_at_which_the_scene_is_brightest() {
     program.plan(
         "kind = \"sweep\"\n[sweep]\ndelay_us = [-355, 0, 355]\nexposure_us = [20, 40, 80, 160, 320, 500]\n",
     );
-    let output = program.raysweep(&["--json", "expose", "plan.toml"]);
-    let said = String::from_utf8(output.stdout).unwrap();
-    assert!(output.status.success(), "{said} {}", String::from_utf8_lossy(&output.stderr));
-    let proposed: serde_json::Value = serde_json::from_str(&said).unwrap();
-    let exposure_us = proposed["exposure_us"].as_f64().unwrap();
-    let rig = Rig::load(&program.folder.path().join("rig.toml")).unwrap();
+    let (_, exposure_us, rig) = program.expose();
     let share = |delay_us, exposure_us| brute_force(&rig, delay_us, exposure_us).0;
     assert!(share(0.0, 500.0) < 1e-4, "delay 0 tells nothing");
     let shares = [exposure_us, 1.1 * exposure_us].map(|us| share(355.0, us));
