@@ -413,18 +413,24 @@ fn the_light_of_a_pixel_over_the_delays_is_that_of_the_stack() {
 fn a_session_in_the_trash_is_said_to_be_there_and_is_not_resumed() {
     let lab = Lab::start();
     let session = lab.run(SWEEP);
+    let name = session.file_name().unwrap().to_str().unwrap();
+    let page = lab.view(None);
+    assert_eq!(page.get(&format!("session/{name}")).0, 200);
     let trashed = Session::open(&session).unwrap().trash().unwrap();
     let way_back = format!("is in the trash: `raysweep restore {}`", trashed.display());
     for command in ["show", "resume"] {
         let output = Command::new(env!("CARGO_BIN_EXE_raysweep"))
-            .args([command, session.file_name().unwrap().to_str().unwrap(), "--socket"])
+            .args([command, name, "--socket"])
             .arg(lab.socket())
             .output()
             .unwrap();
         let said = String::from_utf8(output.stderr).unwrap();
         assert!(output.status.code() == Some(1) && said.contains(&way_back), "{command}: {said}");
     }
-    let refused = &lab.view(None).call("resume", json!({ "session": trashed }))["error"];
+    let (_, _, said) = page.get(&format!("session/{name}"));
+    let said = String::from_utf8(said).unwrap();
+    assert!(said.contains(&way_back), "{said}");
+    let refused = &page.call("resume", json!({ "session": trashed }))["error"];
     assert_eq!(refused["data"]["name"], "no_session", "{refused}");
     assert!(refused["message"].as_str().unwrap().contains(&way_back), "{refused}");
 }

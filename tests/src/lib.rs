@@ -55,7 +55,7 @@ pub fn corner_rig(more: &str) -> String {
 
 /// One product of every kind that is possible for a camera of 24 x 16 pixels and a plan with an exposure of 250 us, one
 /// per line, as on the command line.
-pub const PRODUCTS: [&str; 9] = [
+pub const PRODUCTS: [&str; 14] = [
     r#"kind = "regular""#,
     r#"kind = "epipolar""#,
     r#"kind = "epipolar", width_rows = 5"#,
@@ -63,6 +63,11 @@ pub const PRODUCTS: [&str; 9] = [
     r#"kind = "band", from_rows = 1, to_rows = 4, side = "below", name = "just-below""#,
     r#"kind = "relight", stripes = { period_rows = 6, lit_rows = 2 }"#,
     r#"kind = "relight", line = { height_rows = 2, step_rows = 3 }, name = "line""#,
+    r#"kind = "bands", from_rows = -4, to_rows = 4, width_rows = 3, step_rows = 2"#,
+    r#"kind = "captured""#,
+    r#"kind = "captured", delay_us = 0, exposure_us = 250"#,
+    r#"kind = "cross-section", row = 11"#,
+    r#"kind = "cross-section", column = 5"#,
     r#"kind = "delay-profile", pixel = [12, 8]"#,
     r#"kind = "delay-profile", region = [2, 6, 3, 9], exposure_us = 250"#,
 ];

@@ -9,6 +9,7 @@ use ndarray::{Array2, Array3, s};
 use raysweep::control::Control;
 use raysweep_processing::{self as process, Asked, ProcessError};
 use raysweep_proto::{ErrorCode, RunParams};
+use raysweep_session::products::Products;
 use raysweep_session::stack::ArrayName;
 use raysweep_session::{Session, manifest};
 use raysweep_tests::{Bench, Ended, PRODUCTS, corner_rig, data, rig_text, with_products};
@@ -25,13 +26,14 @@ fn asked(products: &[&str], only: bool) -> Asked {
     Asked { products: products.iter().map(|&product| product.to_owned()).collect(), only, ..Asked::default() }
 }
 
-/// Files of a session's products, by name.
+/// Files of a session's products, by their paths.
 fn files(session: &Path) -> BTreeMap<String, Vec<u8>> {
-    let entries = std::fs::read_dir(session.join("products")).unwrap().map(|entry| entry.unwrap().path());
+    let folder = session.join("products");
     let named = |path: std::path::PathBuf| {
-        (path.file_name().unwrap().to_str().unwrap().to_owned(), std::fs::read(&path).unwrap())
+        let name = path.strip_prefix(&folder).unwrap().to_str().unwrap().to_owned();
+        (name, std::fs::read(&path).unwrap())
     };
-    entries.map(named).collect()
+    Products::new(&folder).files().into_iter().map(named).collect()
 }
 
 fn array<D: ndarray::Dimension>(ended: &Ended, name: &str) -> ndarray::Array<f32, D> {
@@ -61,12 +63,12 @@ fn products_made_after_the_fact_have_the_bits_of_those_in_the_plan() {
     assert!(manifest::verify(&session).unwrap().is_empty());
     let listed = manifest::read(&session).unwrap().files;
     assert!(
-        ["line.exr", "delay_profile_t12_s8.csv"]
+        ["line.exr", "line/contact_sheet.png", "captured_100us.mp4", "delay_profile_t12_s8.csv"]
             .iter()
             .all(|name| listed.contains_key(&format!("products/{name}")))
     );
     let report = std::fs::read_to_string(late.session.join("report.html")).unwrap();
-    for shown in ["epipolar_5", "short_range", "Sequence line", "delay_profile_t12_s8"] {
+    for shown in ["epipolar_5", "short_range", "Sequence line", "cross_section_t11", "delay_profile_t12_s8"] {
         assert!(report.contains(shown), "the report lacks {shown}");
     }
 }

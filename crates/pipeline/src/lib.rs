@@ -37,7 +37,7 @@ pub use film::{Cycle, CycleOrder, FilmFrame, FilmImage, FilmSolver};
 pub use findings::{Findings, name as prior_name, rows_to_choose_by};
 pub use light::SeenLight;
 pub use pipeline::{Ordered, Pipeline, PipelineConfig, PipelineError, Sink};
-pub use product::{Product, Profile};
+pub use product::{CrossSection, Product, Profile};
 pub use products::mask;
 pub use products::{Assembly, NotMade, ProductError, ProductSpec};
 pub use queue::{Input, Policy, QueueError, Receiver};

@@ -34,6 +34,8 @@ pub enum Product {
     },
     /// Light as a function of the delay.
     Profile(Profile),
+    /// Light along a row or a column of several images.
+    CrossSection(CrossSection),
 }
 
 impl Product {
@@ -42,6 +44,7 @@ impl Product {
         match self {
             Self::Image { name, .. } | Self::Sequence { name, .. } => name,
             Self::Profile(profile) => &profile.name,
+            Self::CrossSection(section) => &section.name,
         }
     }
 }
@@ -71,5 +74,34 @@ impl Profile {
             ("light_per_area_us", self.measured.normalised_per_us()),
             ("predicted_per_area_us", self.predicted.normalised_per_us()),
         ]
+    }
+}
+
+/// Light along a row or a column of several images.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CrossSection {
+    /// File name without extension.
+    pub name: String,
+    /// Description in one sentence.
+    pub about: String,
+    /// The axis along which it runs: `s` along a row, `t` down a column.
+    pub along: &'static str,
+    /// The images by name, with a value for each pixel.
+    pub curves: Vec<(&'static str, Vec<f64>)>,
+}
+
+impl CrossSection {
+    /// Appends the part below.
+    pub(crate) fn append(&mut self, below: Self) {
+        for ((_, all), (_, more)) in self.curves.iter_mut().zip(below.curves) {
+            all.extend(more);
+        }
+    }
+
+    /// The table to write: names and values of its columns, one row per pixel.
+    pub fn columns(&self) -> Vec<(&'static str, Vec<f64>)> {
+        let pixels = self.curves.first().map_or(0, |(_, curve)| curve.len());
+        let places = (0..pixels).map(|pixel| pixel as f64).collect();
+        std::iter::once((self.along, places)).chain(self.curves.iter().cloned()).collect()
     }
 }

@@ -13,6 +13,7 @@ pub mod memory;
 pub mod mirror_response;
 pub mod patterns;
 pub mod plane;
+mod relit;
 mod report;
 pub mod response;
 mod saturation;
@@ -26,13 +27,14 @@ use std::collections::BTreeMap;
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 
-use raysweep_config::{Plan, Procedure};
+use raysweep_config::Procedure;
 use raysweep_session::integrity::{Audit, Damage, DamagedPart};
 use raysweep_session::ledger::State;
 use raysweep_session::manifest::FileRecord;
 use raysweep_session::{Session, manifest};
 
 pub use export::{ExportFormat, ExportScope, copy_acquired, export, export_as};
+pub use relit::{RelitImage, RelitPicture, relit};
 pub use software::SOFTWARE;
 pub use stored::{Asked, ProcessError, Processed, Stored};
 
@@ -142,19 +144,14 @@ fn keep_damaged(session: &Session, before: Vec<DamagedResult>) -> Result<(), Pro
 
 /// Processes what is not damaged.
 fn process_sound(session: &Session, state: &State, asked: &Asked) -> Result<Processed, ProcessError> {
-    let path = session.plan_path();
-    let plan_text = session.read_text(&path)?;
-    let plan = Plan::parse_stored(&plan_text)
-        .map_err(|error| ProcessError::Config(error.render(&path.display().to_string(), &plan_text)))?;
-    let stored = Stored { session, state, plan: &plan, plan_text: &plan_text };
-    match plan.procedure.clone() {
-        Procedure::Sweep(own) => sweep::process(&stored, own, asked),
-        Procedure::Film(own) => film::process(&stored, own, asked),
-        Procedure::Batches(own) => batches::process(&stored, own, asked),
-        Procedure::Response(own) => response::process(&stored, own, asked),
-        Procedure::Darks(own) => darks::process(&stored, own, asked),
-        Procedure::Calibration(own) => calibration::process(&stored, own, asked),
-        Procedure::Patterns(own) => patterns::process(&stored, own, asked),
-        Procedure::Viewfinder(own) => viewfinder::process(&stored, own, asked),
-    }
+    Stored::with(session, state, |stored| match stored.plan.procedure.clone() {
+        Procedure::Sweep(own) => sweep::process(stored, own, asked),
+        Procedure::Film(own) => film::process(stored, own, asked),
+        Procedure::Batches(own) => batches::process(stored, own, asked),
+        Procedure::Response(own) => response::process(stored, own, asked),
+        Procedure::Darks(own) => darks::process(stored, own, asked),
+        Procedure::Calibration(own) => calibration::process(stored, own, asked),
+        Procedure::Patterns(own) => patterns::process(stored, own, asked),
+        Procedure::Viewfinder(own) => viewfinder::process(stored, own, asked),
+    })
 }

@@ -138,6 +138,22 @@ pub struct Stored<'a> {
 }
 
 impl Stored<'_> {
+    /// Reads a session's plan, and calls `read` with all that there is.
+    ///
+    /// # Errors
+    /// When the plan cannot be read, and those of `read`.
+    pub(crate) fn with<T>(
+        session: &Session,
+        state: &State,
+        read: impl FnOnce(&Stored<'_>) -> Result<T, ProcessError>,
+    ) -> Result<T, ProcessError> {
+        let path = session.plan_path();
+        let plan_text = session.read_text(&path)?;
+        let plan = Plan::parse_stored(&plan_text)
+            .map_err(|error| ProcessError::Config(error.render(&path.display().to_string(), &plan_text)))?;
+        read(&Stored { session, state, plan: &plan, plan_text: &plan_text })
+    }
+
     /// Wraps an error in the session's plan.
     pub(crate) fn in_plan(&self, error: &ConfigError) -> ProcessError {
         let path = self.session.plan_path().display().to_string();

@@ -22,6 +22,7 @@ pub use self::video::{VideoWriter, video_tone_map};
 pub use self::volume::VolumeWriter;
 use crate::{Error, Result, durable, exr_file, input};
 
+mod pictures;
 mod video;
 mod volume;
 
@@ -152,7 +153,8 @@ impl Products {
         self.write_array(name, &values, metadata)
     }
 
-    /// [`Products::sequence`] with one mask for all images, as in [`Products::masked_image`].
+    /// [`Products::sequence`] with one mask for all images, as in [`Products::masked_image`], and with pictures:
+    /// `NAME/0000.png` and so on, and `NAME/contact_sheet.png`.
     ///
     /// # Errors
     /// As [`Products::sequence`] and [`Products::masked_image`].
@@ -165,7 +167,8 @@ impl Products {
         metadata: &Map<String, Value>,
     ) -> Result<()> {
         let shown = self.write_mask(name, mask, &values.shape()[1..])?;
-        self.layers(name, values, layers, Some(shown.view()), metadata)
+        self.layers(name, values, layers, Some(shown.view()), metadata)?;
+        self.write_pictures(name, values)
     }
 
     /// Writes columns of equal length as `name.csv`, `name.npy` (`[row, column]`) and `name.json`. The first

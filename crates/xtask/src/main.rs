@@ -1,4 +1,4 @@
-//! `cargo xtask demo | test | packages | fresh | deb | guest | soak | bench`: the project's own commands. Apart
+//! `cargo xtask demo | test | figures | packages | fresh | deb | guest | soak | bench`: the project's own commands. Apart
 //! from std it uses the small clang-sys alone, so that it builds quickly everywhere.
 
 mod bench;
@@ -6,6 +6,7 @@ mod binaries;
 mod daemon;
 mod deb;
 mod demo;
+mod figures;
 mod fresh;
 mod guest;
 mod packages;
@@ -27,6 +28,8 @@ usage: cargo xtask <command>
   demo               builds, runs the paper's sweep on the simulated rig, writes a report
   test [--no-guest]  installs what the tests need, checks format, lints and tests, with both
                      guests beside the tests; --no-guest leaves those out
+  figures            the figures of Kubo et al. on the simulated rig, compared with the scenes' true transport, as
+                     one page
   packages           what the tests need of Debian, what of it is missing, and how to install it
   fresh [12|13]...   runs demo and test of the last commit on a bare Debian 12 (bookworm) and 13 (trixie), or on
                      one: about 40 minutes each
@@ -57,7 +60,8 @@ fn main() -> ExitCode {
         },
         ["packages"] => packages::print(),
         ["deb"] => deb::deb(),
-        [command @ ("demo" | "packages" | "deb"), unknown, ..] => {
+        ["figures"] => figures::figures(),
+        [command @ ("demo" | "packages" | "deb" | "figures"), unknown, ..] => {
             Err(format!("`{unknown}` is not an option of {command}; it has none"))
         }
         ["fresh", releases @ ..] => fresh::fresh(releases),

@@ -273,6 +273,18 @@ pub enum Command {
         #[arg(long, value_name = "FOLDER")]
         to: PathBuf,
     },
+    /// Relight a scene by the transport of a sweep, beside captures of it under the same pictures of rows, and tell by how
+    /// much they differ
+    Relit {
+        /// The sweep's folder, or its name within the daemon's data folder
+        sweep: PathBuf,
+        /// Sessions of kind `patterns`, with regular images under pictures of rows
+        #[arg(required = true)]
+        captures: Vec<PathBuf>,
+        /// The folder to create, with images and pictures
+        #[arg(long, value_name = "FOLDER")]
+        to: PathBuf,
+    },
     /// Write manual pages and shell completions of all programs, for packages
     #[command(hide = true)]
     Manuals {

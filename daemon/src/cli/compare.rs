@@ -41,9 +41,13 @@ pub(super) struct Compared {
     pub picture: Option<PictureOfDifference>,
 }
 
-/// The difference of an image, B - A.
+/// The difference of an image, B - A, over the pixels that are numbers in both.
 #[derive(Debug, Serialize, PartialEq)]
 struct Difference {
+    /// Pixels that are numbers in both.
+    compared: usize,
+    /// Pixels of the image.
+    pixels: usize,
     /// Root mean square of the first image.
     rms: f64,
     /// Root mean square of the difference.
@@ -119,13 +123,8 @@ impl Compared {
             rows.extend(warnings.iter().map(|warning| ("warning", format!("only in {which}: {warning}"))));
         }
         title = "products";
-        for (name, Difference { rms, rms_difference, largest }) in &self.products {
-            let share =
-                if *rms > 0.0 { format!(" ({:.2} %)", 100.0 * rms_difference / rms) } else { String::new() };
-            rows.push((
-                title,
-                format!("{name}: RMS of B - A {rms_difference:.3e}{share}, at most {largest:+.3e}"),
-            ));
+        for (name, difference) in &self.products {
+            rows.push((title, format!("{name}: {}", difference.text())));
             title = "";
         }
         rows.extend(self.unlike.iter().map(|name| ("", format!("{name}: not in both, or of another shape"))));
@@ -139,13 +138,43 @@ impl Compared {
 
 impl Difference {
     fn of(a: &Array2<f32>, b: &Array2<f32>) -> Self {
-        let difference = b.mapv(f64::from) - a.mapv(f64::from);
-        let rms = |image: &Array2<f64>| (image.mapv(|value| value * value).mean().unwrap_or(0.0)).sqrt();
-        let largest = difference
-            .iter()
-            .copied()
-            .fold(0.0, |most: f64, value| if value.abs() > most.abs() { value } else { most });
-        Self { rms: rms(&a.mapv(f64::from)), rms_difference: rms(&difference), largest }
+        let pairs = || {
+            let pairs = a.iter().zip(b).map(|(a, b)| (f64::from(*a), f64::from(*b)));
+            pairs.filter(|(a, b)| a.is_finite() && b.is_finite())
+        };
+        let compared = pairs().count();
+        let rms = |of: fn((f64, f64)) -> f64| {
+            let sum: f64 = pairs().map(|pair| of(pair).powi(2)).sum();
+            if compared == 0 { 0.0 } else { (sum / compared as f64).sqrt() }
+        };
+        let difference = |(a, b)| b - a;
+        Self {
+            compared,
+            pixels: a.len(),
+            rms: rms(|(a, _)| a),
+            rms_difference: rms(difference),
+            largest: pairs().map(difference).fold(
+                0.0,
+                |most: f64, value| {
+                    if value.abs() > most.abs() { value } else { most }
+                },
+            ),
+        }
+    }
+
+    fn text(&self) -> String {
+        let Self { compared, pixels, rms, rms_difference, largest } = self;
+        if *compared == 0 {
+            return "no pixel is a number in both".into();
+        }
+        let share =
+            if *rms > 0.0 { format!(" ({:.2} %)", 100.0 * rms_difference / rms) } else { String::new() };
+        let of = if compared < pixels {
+            format!("; over the {compared} of {pixels} pixels that are numbers in both")
+        } else {
+            String::new()
+        };
+        format!("RMS of B - A {rms_difference:.3e}{share}, at most {largest:+.3e}{of}")
     }
 }
 
@@ -267,5 +296,16 @@ mod tests {
         let (a, b) = (arr2(&[[3.0, 4.0]]), arr2(&[[3.0, 1.0]]));
         let found = Difference::of(&a, &b);
         assert_eq!((found.rms, found.rms_difference, found.largest), (12.5_f64.sqrt(), 4.5_f64.sqrt(), -3.0));
+        assert_eq!(found.text(), "RMS of B - A 2.121e0 (60.00 %), at most -3.000e0");
+    }
+
+    #[test]
+    fn pixels_that_are_no_numbers_are_not_compared() {
+        let (a, b) = (arr2(&[[f32::NAN, 4.0, 1.0]]), arr2(&[[3.0, 1.0, f32::INFINITY]]));
+        let found = Difference::of(&a, &b);
+        assert_eq!((found.rms, found.rms_difference, found.largest), (4.0, 3.0, -3.0));
+        assert!(found.text().ends_with("; over the 1 of 3 pixels that are numbers in both"));
+        let none = Difference::of(&arr2(&[[f32::NAN]]), &arr2(&[[1.0]]));
+        assert_eq!(none.text(), "no pixel is a number in both");
     }
 }

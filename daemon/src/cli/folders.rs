@@ -25,15 +25,19 @@ pub(super) fn folder_of(given: PathBuf, socket: &Path) -> Result<PathBuf, Comman
         }
         data = data_folder(socket);
     }
-    let trashed = data.map(|data| data.join(TRASH).join(name));
-    match trashed.filter(|trashed| !name.is_empty() && trashed.exists()) {
-        Some(trashed) => Err(CommandFailure::Trash(format!(
-            "{} is in the trash: `raysweep restore {}` brings it back",
-            name.display(),
-            trashed.display()
-        ))),
+    match data.and_then(|data| why_gone(&data.join(name))) {
+        Some(why) => Err(CommandFailure::Trash(why)),
         None => Ok(given),
     }
+}
+
+/// Where a session is that is not in its folder any more, if it lies in the trash.
+pub(super) fn why_gone(folder: &Path) -> Option<String> {
+    let name = folder.file_name()?;
+    let trashed = folder.parent()?.join(TRASH).join(name);
+    (!folder.exists() && trashed.exists()).then(|| {
+        format!("{} is in the trash: `raysweep restore {}` brings it back", name.display(), trashed.display())
+    })
 }
 
 /// The daemon's data folder, if it answers and tells it.

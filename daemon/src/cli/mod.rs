@@ -19,6 +19,7 @@ mod picture_file;
 mod plan_file;
 mod preview;
 mod printer;
+mod relit;
 mod resume;
 mod sessions;
 mod setup;
@@ -261,6 +262,9 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
         Command::Profiles { labelled, refractive_index, maps, to } => {
             let about = materials::ProfileLook { refractive_index, maps };
             materials::profiles(labelled, about, &to, |given| folder_of(given, &socket), printer)?;
+        }
+        Command::Relit { sweep, captures, to } => {
+            relit::compare(sweep, captures, &to, |given| folder_of(given, &socket), printer)?;
         }
         Command::Manuals { folder } => {
             manuals::write(&folder).map_err(|source| CommandFailure::Write { path: folder, source })?;

@@ -121,6 +121,8 @@ pub(super) struct SessionView {
     pub products: Vec<PathBuf>,
     /// Pictures that any program shows.
     pictures: Vec<PathBuf>,
+    /// Videos that any program shows.
+    videos: Vec<PathBuf>,
     /// Small pictures, if they were asked for.
     pub thumbnails: Vec<PathBuf>,
 }
@@ -172,6 +174,7 @@ impl SessionView {
             report: report.exists().then_some(report),
             products: with_ending("npy"),
             // Of a video, the first.
+            videos: with_ending("mp4"),
             pictures: with_ending("png").into_iter().filter(|path| path.ends_with("0000.png")).collect(),
             thumbnails: Vec::new(),
         })
@@ -227,8 +230,12 @@ impl SessionView {
             title = "";
         }
         rows.extend(self.report.iter().map(|report| ("report", report.display().to_string())));
-        let files =
-            [("products", &self.products), ("pictures", &self.pictures), ("thumbnails", &self.thumbnails)];
+        let files = [
+            ("products", &self.products),
+            ("pictures", &self.pictures),
+            ("videos", &self.videos),
+            ("thumbnails", &self.thumbnails),
+        ];
         for (key, paths) in files {
             title = key;
             for path in paths {

@@ -85,6 +85,15 @@ impl Assembly {
             ProductKind::Epipolar(width) => width.of(stack.one_band).epipolar(name, transport, mask),
             ProductKind::NonEpipolar(width) => width.of(stack.one_band).non_epipolar(name, transport, mask),
             ProductKind::Band(band) => band.of(stack.one_band).make(name, transport, mask),
+            ProductKind::Bands(bands) => {
+                bands.make(name, stack.timing.row_time_us(), stack.one_band, transport, mask)
+            }
+            ProductKind::Captured(captured) => captured.make(name, stack, mask).map_err(not_made)?,
+            ProductKind::CrossSection(cut) => {
+                let part = cut.make(name, first_row, stack, transport).map_err(not_made)?;
+                self.parts.extend(part);
+                return Ok(());
+            }
             ProductKind::Relight(pattern) => pattern
                 .make(name, &stack.timing, first_row, transport, mask)
                 .map_err(|error| not_made(error.to_string()))?,
@@ -139,7 +148,15 @@ impl Assembly {
                     (one_below_the_other(images, rest), one_mask_below_the_other(mask, masks));
                 Product::Sequence { name, about, axis, at, images, mask }
             }
-            other => other,
+            Product::CrossSection(mut whole) => {
+                for part in parts {
+                    if let Product::CrossSection(part) = part {
+                        whole.append(part);
+                    }
+                }
+                Product::CrossSection(whole)
+            }
+            other @ Product::Profile(_) => other,
         })
     }
 }

@@ -74,6 +74,11 @@ impl Width {
         self.width_rows / 2
     }
 
+    /// Number of rows.
+    pub(super) fn rows(self) -> u32 {
+        self.width_rows
+    }
+
     /// The relative rows.
     pub(super) fn range(self) -> RangeInclusive<i32> {
         let half = i32::try_from(self.half()).unwrap_or(i32::MAX);

@@ -21,7 +21,7 @@ pub const OUTSIDE_REACH: u8 = 8;
 pub const NO_EDGE: u8 = 16;
 
 /// Rows as near as this to the pixel's own are told apart only by edges of exposures.
-const NEAR_ROWS: RangeInclusive<i32> = -2..=2;
+pub(super) const NEAR_ROWS: RangeInclusive<i32> = -2..=2;
 
 /// Bits of each value of camera rows `rows` of a transport, `[u, t, s]`.
 pub fn of_transport(transport: &Transport, rows: Range<usize>) -> Array3<u8> {
@@ -89,18 +89,23 @@ pub(super) fn of(
     let rows = kind.rows();
     let is_lit = |u: i32| rows.iter().any(|rows| rows.contains(&u));
     let near = NEAR_ROWS.filter(|&u| is_lit(u)).count();
-    let separates = near > 0 && near < NEAR_ROWS.count();
+    let separates = near > 0 && (near < NEAR_ROWS.count() || kind.tells_each_band());
     // Rows without end mean those within the reach.
     let asked = |u: i32| {
         rows.iter().any(|rows| *rows.start() > i32::MIN && *rows.end() < i32::MAX && rows.contains(&u))
     };
     let measured =
         stack.valid.as_ref().map(|valid| valid.map_axis(Axis(0), |valid| valid.iter().any(|v| *v)));
+    let saturates = match kind {
+        ProductKind::Captured(captured) => captured.saturates(stack),
+        _ => None,
+    };
     let at = |map: &Option<Array2<bool>>, pixel, absent| map.as_ref().map_or(absent, |map| map[pixel]);
     Ok(Array2::from_shape_fn((height, width), |pixel| {
         let (t, s) = pixel;
         let is_bound = match (kind, &relit) {
             (ProductKind::Regular, _) => !at(&stack.regular_valid, pixel, true),
+            (ProductKind::Captured(_), _) => at(&saturates, pixel, false),
             (_, Some(relit)) => relit.is_bound[pixel],
             _ => rows.iter().any(|rows| transport.is_bound([t, s], rows.clone())),
         };

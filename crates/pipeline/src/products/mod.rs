@@ -3,7 +3,11 @@
 
 mod assembly;
 mod band;
+mod bands;
+mod captured;
+mod cross_section;
 pub mod mask;
+mod planned;
 mod profile;
 mod relight;
 mod spec;

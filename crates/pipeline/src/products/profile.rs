@@ -5,8 +5,9 @@ use ndarray::Axis;
 use raysweep_transport::plane::{DelayProfile, Setting, Transport};
 use serde::Deserialize;
 
+use super::planned::Planned;
 use crate::product::{Product, Profile};
-use crate::schedule::{PointRole, Schedule, SweepGeometry};
+use crate::schedule::{Schedule, SweepGeometry};
 use crate::stack::SweepStack;
 
 /// Options of `delay-profile`, as given in a plan.
@@ -26,7 +27,7 @@ pub(super) struct ProfileTable {
 pub(super) struct ProfileOptions {
     /// `[t0, t1, s0, s1]`, half open; a pixel is a region of one.
     region: [usize; 4],
-    exposure_us: f64,
+    planned: Planned,
 }
 
 /// Sums over the pixels of a profile, accumulated over the camera rows from top to bottom.
@@ -68,19 +69,10 @@ impl ProfileTable {
             }
             _ => return Err(("pixel", "give either pixel = [t, s] or region = [t0, t1, s0, s1]".into())),
         };
-        let sweep = schedule.points.iter().filter(|point| matches!(point.role, PointRole::Sweep(_)));
-        let mut exposures_us: Vec<f64> = sweep.map(|point| point.exposure_us).collect();
-        exposures_us.sort_by(f64::total_cmp);
-        let shortest_us = exposures_us.first().copied().unwrap_or_default();
-        let exposure_us = self.exposure_us.unwrap_or(shortest_us);
-        let delays = exposures_us.iter().filter(|&&us| us == exposure_us).count();
-        exposures_us.dedup();
+        let planned = Planned::new(schedule, self.exposure_us)?;
+        let Planned { exposure_us, delays, .. } = planned;
         match delays {
-            MIN_DELAYS.. => Ok(ProfileOptions { region, exposure_us }),
-            0 => Err((
-                "exposure_us",
-                format!("exposure_us = {exposure_us}: must be one of the plan's {exposures_us:?}"),
-            )),
+            MIN_DELAYS.. => Ok(ProfileOptions { region, planned }),
             _ => {
                 let what = format!(
                     "exposure_us = {exposure_us}: a profile needs at least {MIN_DELAYS} delays, but the plan has {delays} at this exposure"
@@ -109,8 +101,7 @@ impl ProfileOptions {
         stack: &SweepStack,
         transport: &Transport,
     ) {
-        let taken: Vec<usize> =
-            (0..stack.settings.len()).filter(|&n| stack.exposures_us[n] == self.exposure_us).collect();
+        let taken = self.planned.images_of(stack);
         if sums.settings.is_empty() {
             sums.settings = taken.iter().map(|&n| stack.settings[n].clone()).collect();
             sums.measured = vec![0.0; taken.len()];
@@ -143,7 +134,7 @@ impl ProfileOptions {
     }
 
     pub(super) fn make(self, name: String, sums: &ProfileSums) -> Result<Product, String> {
-        let exposure_us = self.exposure_us;
+        let exposure_us = self.planned.exposure_us;
         let taken = sums.settings.len();
         if taken < MIN_DELAYS {
             return Err(format!(

@@ -7,6 +7,9 @@ use serde::de::DeserializeOwned;
 use serde_json::{Map, Value};
 
 use super::band::{Band, Width};
+use super::bands::Bands;
+use super::captured::{Captured, CapturedTable};
+use super::cross_section::{CrossSectionTable, SectionLine};
 use super::profile::{ProfileOptions, ProfileTable};
 use super::relight::{BeamName, Relight, RowPattern};
 use super::uncertainty::LightOf;
@@ -39,6 +42,9 @@ pub(super) enum ProductKind {
     Epipolar(Width),
     NonEpipolar(Width),
     Band(Band),
+    Bands(Bands),
+    Captured(Captured),
+    CrossSection(SectionLine),
     Relight(Relight),
     DelayProfile(ProfileOptions),
     Uncertainty(LightOf),
@@ -59,7 +65,8 @@ impl ProductKind {
     /// The relative rows whose light it tells apart; `i32::MIN` and `i32::MAX`: as far as the sweep reaches.
     pub(super) fn rows(&self) -> Vec<RangeInclusive<i32>> {
         match self {
-            Self::Regular | Self::DelayProfile(_) => Vec::new(),
+            Self::Regular | Self::Captured(_) | Self::CrossSection(_) | Self::DelayProfile(_) => Vec::new(),
+            Self::Bands(bands) => vec![bands.range()],
             Self::Epipolar(width) => vec![width.range()],
             Self::NonEpipolar(width) => {
                 let own = width.range();
@@ -70,10 +77,15 @@ impl ProductKind {
             Self::Relight(_) => vec![i32::MIN..=i32::MAX],
         }
     }
+
+    /// Whether it shows parts of its rows apart.
+    pub(super) fn tells_each_band(&self) -> bool {
+        matches!(self, Self::Bands(_))
+    }
 }
 
 /// The kinds by their names in plans.
-const KINDS: &str = "epipolar, non-epipolar, band, regular, relight, delay-profile, uncertainty, prior-bias";
+const KINDS: &str = "epipolar, non-epipolar, band, bands, regular, captured, relight, delay-profile, cross-section, uncertainty, prior-bias";
 
 /// The file name of the transport itself, which products must not use.
 const TAKEN_NAME: &str = "transport";
@@ -115,6 +127,15 @@ impl ProductSpec {
             "epipolar" => ProductKind::Epipolar(parse::<Width>(kind, options)?.check().map_err(one)?),
             "non-epipolar" => ProductKind::NonEpipolar(parse::<Width>(kind, options)?.check().map_err(one)?),
             "band" => ProductKind::Band(parse::<Band>(kind, options)?.check().map_err(one)?),
+            "bands" => ProductKind::Bands(parse::<Bands>(kind, options)?.check().map_err(one)?),
+            "captured" => {
+                let table: CapturedTable = parse(kind, options)?;
+                ProductKind::Captured(table.check(schedule).map_err(one)?)
+            }
+            "cross-section" => {
+                let table: CrossSectionTable = parse(kind, options)?;
+                ProductKind::CrossSection(table.check(schedule, geometry).map_err(one)?)
+            }
             "uncertainty" => ProductKind::Uncertainty(light_of(kind, options, geometry)?),
             "prior-bias" => ProductKind::PriorBias(light_of(kind, options, geometry)?),
             "relight" => ProductKind::Relight(relight(kind, options, geometry)?),
@@ -156,8 +177,13 @@ impl ProductSpec {
         let what = match &self.kind {
             ProductKind::Epipolar(width) | ProductKind::NonEpipolar(width) => width.beyond(first, last),
             ProductKind::Band(band) => band.beyond(first, last),
+            ProductKind::Bands(bands) => bands.beyond(first, last),
             ProductKind::Uncertainty(of) | ProductKind::PriorBias(of) => of.beyond(first, last),
-            ProductKind::Regular | ProductKind::Relight(_) | ProductKind::DelayProfile(_) => None,
+            ProductKind::Regular
+            | ProductKind::Captured(_)
+            | ProductKind::CrossSection(_)
+            | ProductKind::Relight(_)
+            | ProductKind::DelayProfile(_) => None,
         }?;
         Some(format!("product {}: {what}", self.name))
     }
@@ -179,7 +205,13 @@ impl ProductSpec {
             ProductKind::Relight(_) => {
                 "line gives a sequence of images, and a film has one for each cycle: use rows or stripes"
             }
-            ProductKind::Regular | ProductKind::DelayProfile(_) => {
+            ProductKind::Bands(_) => {
+                "gives a sequence of images, and a film has one for each cycle: use band"
+            }
+            ProductKind::Regular
+            | ProductKind::Captured(_)
+            | ProductKind::CrossSection(_)
+            | ProductKind::DelayProfile(_) => {
                 "needs the images of a sweep: a film's products are epipolar, non-epipolar, band, relight, uncertainty and prior-bias"
             }
         };
@@ -190,7 +222,9 @@ impl ProductSpec {
     pub fn images(&self, geometry: &SweepGeometry) -> usize {
         match &self.kind {
             ProductKind::Relight(pattern) => pattern.images(geometry),
-            ProductKind::DelayProfile(_) => 0,
+            ProductKind::Bands(bands) => bands.images(),
+            ProductKind::Captured(captured) => captured.images(),
+            ProductKind::CrossSection(_) | ProductKind::DelayProfile(_) => 0,
             ProductKind::Regular
             | ProductKind::Epipolar(_)
             | ProductKind::NonEpipolar(_)
@@ -208,6 +242,9 @@ impl ProductKind {
             Self::Epipolar(width) => width.named("epipolar"),
             Self::NonEpipolar(width) => width.named("non_epipolar"),
             Self::Band(band) => band.default_name(),
+            Self::Bands(bands) => bands.default_name(),
+            Self::Captured(captured) => captured.default_name(),
+            Self::CrossSection(cut) => cut.default_name(),
             Self::Relight(_) => "relight".into(),
             Self::DelayProfile(options) => options.default_name(),
             Self::Uncertainty(of) => format!("uncertainty_{}", of.default_name()),

@@ -180,6 +180,98 @@ fn a_delay_profile_is_what_the_forward_model_says_of_its_pixels() {
 }
 
 #[test]
+fn captured_images_are_those_of_the_stack_by_delay() {
+    let make = |stack: &SweepStack, table: Value| spec(&table).unwrap().make(stack, &transport());
+    let mut stack = stack();
+    // Taken in another order, and not quite at the planned delays.
+    for (n, delay_us) in [(0, 61.5), (2, -58.0)] {
+        stack.settings[n].delays_us = vec![delay_us - 1.0, delay_us + 1.0];
+    }
+    let film = make(&stack, json!({ "kind": "captured" })).unwrap();
+    let Product::Sequence { name, at, images, .. } = film else { panic!() };
+    assert_eq!((name.as_str(), at.as_slice()), ("captured_100us", [-58.0, 0.0, 61.5].as_slice()));
+    assert_eq!(images, stack.images.select(Axis(0), &[2, 1, 0]));
+    let one = make(&stack, json!({ "kind": "captured", "delay_us": -60, "exposure_us": 100.0 })).unwrap();
+    let Product::Image { name, image, .. } = one else { panic!() };
+    assert_eq!(
+        (name.as_str(), image),
+        ("captured_-60us_100us", stack.images.index_axis(Axis(0), 2).to_owned())
+    );
+    assert_eq!(spec(&json!({ "kind": "captured" })).unwrap().images(&geometry()), 3);
+    stack.keep(|n| n != 2);
+    let missing = make(&stack, json!({ "kind": "captured", "delay_us": -60 })).unwrap_err();
+    assert!(missing.what.contains("no image at -60 µs delay"), "{missing}");
+}
+
+#[test]
+fn a_captured_image_is_a_bound_where_it_saturates() {
+    let mut stack = stack();
+    let mut valid = Array3::from_elem(stack.images.dim(), true);
+    valid[[1, 4, 2]] = false;
+    valid[[4, 0, 0]] = false;
+    stack.valid = Some(valid);
+    let table = json!({ "kind": "captured", "delay_us": 0 });
+    let Product::Image { mask, .. } = spec(&table).unwrap().make(&stack, &transport()).unwrap() else {
+        panic!()
+    };
+    assert_eq!(
+        (mask[[4, 2]], mask[[0, 0]]),
+        (mask::BOUND_ONLY, mask::MEASURED),
+        "the other is another image's"
+    );
+}
+
+#[test]
+fn bands_are_the_sums_of_their_rows() {
+    let table = json!({ "kind": "bands", "from_rows": -3, "to_rows": 3, "width_rows": 3, "step_rows": 2 });
+    let bands = spec(&table).unwrap();
+    let film = bands.make(&stack(), &transport()).unwrap();
+    let Product::Sequence { name, at, images, mask, .. } = film else { panic!() };
+    assert_eq!((name.as_str(), at.as_slice()), ("bands_-3_to_3_3", [-3.0, -1.0, 1.0, 3.0].as_slice()));
+    for (image, first) in images.outer_iter().zip([0, 2, 4, 6]) {
+        assert_eq!(image, transport().t.slice(s![first..first + 3, .., ..]).sum_axis(Axis(0)));
+    }
+    assert_eq!((bands.images(&geometry()), mask[[0, 0]]), (4, mask::MEASURED));
+    let beyond = spec(&json!({ "kind": "bands", "from_rows": 6, "to_rows": 9 })).unwrap().beyond((-4, 4));
+    assert!(beyond.unwrap().contains("beyond the reach of rows -4 to 4"));
+    // Where no setting tells the rows next to the pixel's own apart, they are one band.
+    let one_band = SweepStack { one_band: true, ..stack() };
+    let single = spec(&json!({ "kind": "bands", "from_rows": -4, "to_rows": 3 })).unwrap();
+    let Product::Sequence { at, images, .. } = single.make(&one_band, &transport()).unwrap() else {
+        panic!()
+    };
+    assert_eq!(at, [-4.0, -3.0, 0.0, 3.0]);
+    assert_eq!(images.index_axis(Axis(0), 2), transport().t.slice(s![2..7, .., ..]).sum_axis(Axis(0)));
+}
+
+#[test]
+fn a_cross_section_cuts_its_three_images() {
+    let stack =
+        SweepStack { regular: Some(Array2::from_shape_fn((6, 3), |(t, s)| (10 * t + s) as f32)), ..stack() };
+    let cut = |table: Value| {
+        let Product::CrossSection(section) = spec(&table).unwrap().make(&stack, &transport()).unwrap() else {
+            panic!()
+        };
+        section
+    };
+    let wide =
+        |line: ndarray::ArrayView1<f32>| line.iter().map(|light| f64::from(*light)).collect::<Vec<_>>();
+    let row = cut(json!({ "kind": "cross-section", "row": 4 }));
+    let expected = [
+        ("s", vec![0.0, 1.0, 2.0]),
+        ("regular", vec![40.0, 41.0, 42.0]),
+        ("captured", wide(stack.images.slice(s![1, 4, ..]))),
+        ("sharpened", wide(transport().t.slice(s![4, 4, ..]))),
+    ];
+    assert_eq!((row.name.as_str(), row.columns().as_slice()), ("cross_section_t4", expected.as_slice()));
+    let column = cut(json!({ "kind": "cross-section", "column": 1, "exposure_us": 200 }));
+    assert_eq!(
+        (column.along, &column.curves[1]),
+        ("t", &("captured", wide(stack.images.slice(s![4, .., 1]))))
+    );
+}
+
+#[test]
 fn saturated_pixels_are_left_out_of_a_profile_and_said_to_be() {
     let mut stack = stack();
     let mut valid = Array3::from_elem(stack.images.dim(), true);
@@ -232,6 +324,11 @@ fn products_of_strips_have_the_bits_of_the_whole() {
         json!({ "kind": "relight", "rows": [{ "first": 1, "last": 8, "weight": 0.3 }] }),
         json!({ "kind": "relight", "stripes": { "period_rows": 3, "lit_rows": 2, "phase_rows": 1 } }),
         json!({ "kind": "relight", "line": { "height_rows": 2, "step_rows": 2 } }),
+        json!({ "kind": "bands", "from_rows": -2, "to_rows": 4, "width_rows": 3 }),
+        json!({ "kind": "captured" }),
+        json!({ "kind": "captured", "delay_us": 60, "exposure_us": 200 }),
+        json!({ "kind": "cross-section", "row": 3 }),
+        json!({ "kind": "cross-section", "column": 2 }),
         json!({ "kind": "delay-profile", "pixel": [3, 1] }),
         json!({ "kind": "delay-profile", "region": [1, 6, 0, 3] }),
         json!({ "kind": "uncertainty", "from_rows": 1, "to_rows": 3 }),
@@ -277,6 +374,18 @@ fn bad_tables_are_refused_by_field_and_value() {
         (json!({ "kind": "band" }), ""),
         (json!({ "kind": "band", "from_rows": 5, "to_rows": 4 }), "to_rows"),
         (json!({ "kind": "band", "from_rows": 5, "side": "left" }), "side"),
+        (json!({ "kind": "bands", "from_rows": 1 }), ""),
+        (json!({ "kind": "bands", "from_rows": 1, "to_rows": 0 }), "to_rows"),
+        (json!({ "kind": "bands", "from_rows": -70000, "to_rows": 0 }), "from_rows"),
+        (json!({ "kind": "bands", "from_rows": 0, "to_rows": 4, "width_rows": 2 }), "width_rows"),
+        (json!({ "kind": "bands", "from_rows": 0, "to_rows": 4, "step_rows": 0 }), "step_rows"),
+        (json!({ "kind": "captured", "delay_us": 10 }), "delay_us"),
+        (json!({ "kind": "captured", "delay_us": 60, "exposure_us": 300 }), "delay_us"),
+        (json!({ "kind": "captured", "exposure_us": 150 }), "exposure_us"),
+        (json!({ "kind": "cross-section" }), "row"),
+        (json!({ "kind": "cross-section", "row": 1, "column": 1 }), "row"),
+        (json!({ "kind": "cross-section", "row": 6 }), "row"),
+        (json!({ "kind": "cross-section", "column": 3 }), "column"),
         (json!({ "kind": "relight" }), ""),
         (json!({ "kind": "relight", "rows": [], "stripes": {} }), ""),
         (json!({ "kind": "relight", "rows": [] }), "rows"),

@@ -9,7 +9,7 @@ use super::PatternsTask;
 use crate::plane::place;
 
 /// The images of a session.
-pub(super) struct PictureImages<'a> {
+pub(crate) struct PictureImages<'a> {
     pub task: &'a PatternsTask,
     pub state: &'a State,
     pub stack: &'a Stack,
@@ -17,7 +17,7 @@ pub(super) struct PictureImages<'a> {
 }
 
 /// An image of light `[t, s]`, 1 for a white pixel lit by its own row.
-pub(super) struct LitImage {
+pub(crate) struct LitImage {
     pub light: Array2<f32>,
     /// Where a frame saturated, if any did.
     pub clipped: Option<Array2<u32>>,

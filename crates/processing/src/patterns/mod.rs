@@ -17,7 +17,7 @@ use raysweep_session::{Result, Session, durable};
 use raysweep_transport::plane::separation::{CheckerboardSums, Separated, SeparatedSettings, separate};
 use serde_json::json;
 
-use self::images::{LitImage, PictureImages};
+pub(crate) use self::images::{LitImage, PictureImages};
 use self::task::{EPIPOLAR, REGULAR};
 pub use self::task::{PatternsTask, PictureSetting};
 use crate::plane::manifest;

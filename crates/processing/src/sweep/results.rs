@@ -3,13 +3,17 @@
 use raysweep_pipeline::{Findings, Product, Solved, Strip, SweepSummary, mask};
 use raysweep_session::STRIP_ROWS;
 use raysweep_session::ledger::State;
-use raysweep_session::products::VolumeWriter;
+use raysweep_session::products::{Products, VolumeWriter};
 use raysweep_session::{Result, Session, transport};
 use raysweep_transport::plane::Transport;
 use serde_json::{Map, Value, json};
 
 use super::strips::{Overview, StoredImages};
 use crate::plane::{PlaneTask, Processing, mask_bits};
+use crate::video::Encoder;
+
+/// Pace of the video of a sequence.
+const IMAGES_PER_S: f64 = 10.0;
 
 /// The results of a sweep.
 #[derive(Default)]
@@ -177,17 +181,18 @@ impl TransportWriter {
     }
 }
 
-/// Writes everything but the transport: images (EXR, NPY), sequences (EXR, NPY), profiles (CSV, NPY). Of the products,
-/// only those with a wanted name are written; the report shows all of them.
+/// Writes everything but the transport: images (EXR, NPY), sequences (EXR, NPY, PNG, MP4), tables (CSV, NPY). Of the
+/// products, only those with a wanted name are written; the report shows all of them.
 ///
 /// # Errors
 /// When the session cannot be written.
 pub fn write_products(
     session: &Session,
     task: &PlaneTask,
-    results: &Results,
+    results: &mut Results,
     is_wanted: &dyn Fn(&str) -> bool,
 ) -> Result<()> {
+    let mut encoder = Encoder::default();
     let files = session.products();
     let mut common = task.metadata();
     // As it was found, if the rig file does not state it.
@@ -211,22 +216,35 @@ pub fn write_products(
                 metadata.insert("layers".into(), json!(layers));
                 metadata.insert("mask".into(), mask_bits());
                 files.masked_sequence(name, images.view(), &layers, mask.view(), &metadata)?;
+                encoder.encode(files.dir(), name, IMAGES_PER_S)?;
             }
             Product::Profile(profile) => {
-                let columns = profile.columns();
                 let mut metadata = common.clone();
-                metadata.insert("axes".into(), json!(["delay", "column"]));
-                metadata.insert("about".into(), json!(profile.about));
                 metadata.insert("exposure_us".into(), json!(profile.exposure_us));
-                metadata.insert(
-                    "columns".into(),
-                    json!(columns.iter().map(|(name, _)| name).collect::<Vec<_>>()),
-                );
-                files.table(&profile.name, &columns, &metadata)?;
+                let table = (profile.name.as_str(), profile.about.as_str());
+                write_table(&files, table, "delay", &profile.columns(), metadata)?;
+            }
+            Product::CrossSection(section) => {
+                let table = (section.name.as_str(), section.about.as_str());
+                write_table(&files, table, section.along, &section.columns(), common.clone())?;
             }
         }
     }
+    results.problems.append(&mut encoder.problems);
     Ok(())
+}
+
+fn write_table(
+    files: &Products,
+    (name, about): (&str, &str),
+    along: &str,
+    columns: &[(&str, Vec<f64>)],
+    mut metadata: Map<String, Value>,
+) -> Result<()> {
+    metadata.insert("axes".into(), json!([along, "column"]));
+    metadata.insert("about".into(), json!(about));
+    metadata.insert("columns".into(), json!(columns.iter().map(|(name, _)| name).collect::<Vec<_>>()));
+    files.table(name, columns, &metadata)
 }
 
 /// The model and settings that the transport was estimated with.

@@ -36,6 +36,7 @@ use self::guard::Guard;
 use self::hub::Hub;
 use super::exit::Exit;
 use super::failure::CommandFailure;
+use super::folders::why_gone;
 use super::printer::Printer;
 use super::show;
 
@@ -331,10 +332,10 @@ async fn read_session(
     };
     read(move || {
         let folder = listing.or_else(|_turn| view.hub.session(&session))?;
-        match barred(&folder) {
-            Some(why) => Ok(refused(StatusCode::FORBIDDEN, &why)),
-            None => reading(&folder),
+        if let Some(why) = barred(&folder) {
+            return Ok(refused(StatusCode::FORBIDDEN, &why));
         }
+        why_gone(&folder).map_or_else(|| reading(&folder), Err)
     })
     .await
 }

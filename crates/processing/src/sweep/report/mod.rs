@@ -64,6 +64,7 @@ fn make(
         sections.push(profiles(&sweep, overview.u_min, &over_rows, &markers)?);
         sections.extend(products::sequences(products));
         sections.extend(products::profiles(products));
+        sections.extend(products::cross_sections(products));
     }
     sections.push(sweep.contact_sheet()?);
     sections.extend(summary.iter().map(|summary| findings::section(&summary.findings)));

@@ -1,7 +1,7 @@
 //! The products that a plan names, as pictures and plots.
 
 use ndarray::{Array2, Array3, ArrayView2};
-use raysweep_pipeline::{Product, Profile, mask};
+use raysweep_pipeline::{CrossSection, Product, Profile, mask};
 use raysweep_session::report::{Block, ContactSheet, Marker, Picture, Plot, Section, Series, ToneMap};
 
 /// Percentile of the pixels that maps to white in a picture.
@@ -110,6 +110,33 @@ pub(super) fn profiles(products: &[Product]) -> Option<Section> {
             about.collect::<Vec<_>>().join(" ")
         ),
         blocks: vec![Block::Plots(each.chain([together]).collect())],
+    })
+}
+
+/// Section of the requested cross-sections, if there are any.
+pub(super) fn cross_sections(products: &[Product]) -> Option<Section> {
+    let sections: Vec<&CrossSection> = products
+        .iter()
+        .filter_map(|product| match product {
+            Product::CrossSection(section) => Some(section),
+            _ => None,
+        })
+        .collect();
+    let plot = |section: &CrossSection| {
+        let pixels = |curve: &[f64]| (0..curve.len()).map(|pixel| pixel as f64).zip(curve.to_vec()).collect();
+        Plot {
+            title: section.name.clone(),
+            x_label: format!("{} / pixels", section.along),
+            y_label: "light".into(),
+            series: section.curves.iter().map(|(name, curve)| Series::line(*name, pixels(curve))).collect(),
+            guides: Vec::new(),
+        }
+    };
+    let about = sections.iter().map(|section| format!("{}: {}.", section.name, section.about));
+    (!sections.is_empty()).then(|| Section {
+        title: "Cross-sections".into(),
+        intro: about.collect::<Vec<_>>().join(" "),
+        blocks: vec![Block::Plots(sections.iter().map(|section| plot(section)).collect())],
     })
 }
 
