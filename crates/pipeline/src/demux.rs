@@ -197,7 +197,8 @@ impl DemuxFold {
         let mut delay_sds_us = Vec::with_capacity(taken.len());
         let point_of = |role: &PointRole| self.schedule.points.iter().find(|point| point.role == *role);
         let StripFindings { late_us, .. } = self.jitter();
-        let exposures_us = taken.keys().filter_map(point_of).map(|point| point.exposure_us).collect();
+        let planned = taken.keys().filter_map(point_of);
+        let (delays_us, exposures_us) = planned.map(|point| (point.delay_us, point.exposure_us)).unzip();
         let flicker = self.flicker(&darks, rows);
         for (index, (role, sample)) in taken.into_iter().enumerate() {
             if let Some(valid) = &mut valid {
@@ -216,6 +217,7 @@ impl DemuxFold {
             delay_sds_us.push(late_us.sd);
         }
         Ok(SweepStack {
+            delays_us,
             exposures_us,
             dark_frames,
             delay_sds_us,

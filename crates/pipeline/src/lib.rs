@@ -45,7 +45,7 @@ pub use scale::LightScale;
 pub use schedule::{Point, PointRole, Schedule, Shot, Spot, SpotScan, SweepGeometry};
 pub use spot::SpotCut;
 pub use stack::SweepStack;
-pub use stage::{HotPixels, PlaneStage, Stage, StageError, Stages, message_of, run_stages};
+pub use stage::{HOT_PIXELS, HotPixels, PlaneStage, Stage, StageError, Stages, message_of, run_stages};
 pub use stage_refused::StageRefused;
 pub use strips::{ImageRows, InStrips, NotSolved, PointRows, Strip};
 pub use unit::Unit;

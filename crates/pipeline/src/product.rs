@@ -12,6 +12,8 @@ pub enum Product {
         name: String,
         /// Description in one sentence.
         about: String,
+        /// Whether it shows light, and not how uncertain light is.
+        is_light: bool,
         /// The pixels.
         image: Array2<f32>,
         /// What is known of each pixel, `[t, s]`: the bits of [`crate::mask`].

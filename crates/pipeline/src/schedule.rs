@@ -177,6 +177,20 @@ impl SweepGeometry {
         }
     }
 
+    /// The mean time from one projector row to the next: as calibrated, or as the rig file has it.
+    pub fn row_time_us(&self) -> f64 {
+        match self.calibration.as_deref().map(|calibration| &calibration.row_starts_us[..]) {
+            Some([first, .., last]) => (last - first) / self.raster.rows as f64,
+            _ => self.raster.row_time_us,
+        }
+    }
+
+    /// When the light of projector row 0 begins after the VSYNC edge: as calibrated, or as the rig file has it.
+    pub fn first_row_us(&self) -> f64 {
+        let calibrated = self.calibration.as_deref().and_then(|it| it.row_starts_us.first().copied());
+        calibrated.unwrap_or(self.raster.first_row_us)
+    }
+
     /// The model's setting for images taken with these delays and this exposure, as the camera states them: a
     /// calibrated camera exposes longer or shorter, from the same beginning.
     pub fn setting(&self, delays_us: &[f64], exposure_us: f64) -> Setting {

@@ -11,6 +11,8 @@ pub struct SweepStack {
     pub timing: RowTiming,
     /// The prior used for the transport.
     pub prior: Prior,
+    /// The planned delay of each image.
+    pub delays_us: Vec<f64>,
     /// The planned exposure of each image.
     pub exposures_us: Vec<f64>,
     /// Delays and exposure of each image.
@@ -45,12 +47,13 @@ pub struct SweepStack {
 }
 
 impl SweepStack {
-    /// Images with these settings, of which nothing else is known: exposures as planned, dark images of one frame,
+    /// Images with these settings, of which nothing else is known: delays and exposures as planned, dark images of one frame,
     /// exact delays.
     pub(crate) fn new(timing: RowTiming, prior: Prior, settings: Vec<Setting>, images: Array3<f32>) -> Self {
         Self {
             timing,
             prior,
+            delays_us: settings.iter().map(Setting::mean_delay_us).collect(),
             exposures_us: settings.iter().map(|setting| setting.exposure_us).collect(),
             dark_frames: vec![1; settings.len()],
             delay_sds_us: vec![0.0; settings.len()],
@@ -72,6 +75,7 @@ impl SweepStack {
     pub(crate) fn of_rows(&self, rows: &[usize]) -> Self {
         let images = self.images.select(Axis(1), rows);
         Self {
+            delays_us: self.delays_us.clone(),
             exposures_us: self.exposures_us.clone(),
             dark_frames: self.dark_frames.clone(),
             delay_sds_us: self.delay_sds_us.clone(),
@@ -98,6 +102,7 @@ impl SweepStack {
         if kept.len() == self.settings.len() {
             return;
         }
+        self.delays_us = kept.iter().map(|&n| self.delays_us[n]).collect();
         self.exposures_us = kept.iter().map(|&n| self.exposures_us[n]).collect();
         self.dark_frames = kept.iter().map(|&n| self.dark_frames[n]).collect();
         self.delay_sds_us = kept.iter().map(|&n| self.delay_sds_us[n]).collect();

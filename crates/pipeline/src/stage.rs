@@ -53,6 +53,9 @@ pub enum PlaneStage {
     Demux(DemuxOptions),
 }
 
+/// The name of [`HotPixels`] in plans.
+pub const HOT_PIXELS: &str = "hot-pixels";
+
 impl PlaneStage {
     /// The stage that a plan names, with the plan's options (a JSON object).
     ///
@@ -60,13 +63,13 @@ impl PlaneStage {
     /// For unknown names, and for options that the stage rejects.
     pub fn new(name: &str, options: Value) -> Result<Self, StageRefused> {
         match name {
-            "hot-pixels" => {
+            HOT_PIXELS => {
                 let stage: HotPixels = stage_refused::options(name, options)?;
                 stage.check().map_err(|what| StageRefused::Invalid { name: name.into(), what })?;
                 Ok(Self::Image(Arc::new(stage)))
             }
             DEMUX => Ok(Self::Demux(stage_refused::options(name, options)?)),
-            _ => Err(StageRefused::Unknown { name: name.into(), known: format!("{DEMUX}, hot-pixels") }),
+            _ => Err(StageRefused::Unknown { name: name.into(), known: format!("{DEMUX}, {HOT_PIXELS}") }),
         }
     }
 }
@@ -123,7 +126,7 @@ impl HotPixels {
 
 impl Stage for HotPixels {
     fn name(&self) -> &str {
-        "hot-pixels"
+        HOT_PIXELS
     }
 
     fn apply(&self, _unit: &Unit, image: Array2<f32>) -> Result<Array2<f32>, StageError> {

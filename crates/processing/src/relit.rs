@@ -4,26 +4,27 @@
 
 use std::path::{Path, PathBuf};
 
-use ndarray::{Array1, Array2, ArrayView2, Axis, concatenate, s};
+use ndarray::{Array1, Array2, Array3, ArrayView2, Axis, concatenate, s};
 use raysweep_config::Procedure;
-use raysweep_pipeline::SweepGeometry;
+use raysweep_pipeline::{SweepGeometry, mask};
 use raysweep_session::integrity::damaged_files;
 use raysweep_session::products::Products;
 use raysweep_session::report::{Picture, ToneMap};
-use raysweep_session::{STRIP_ROWS, Session, durable, transport};
-use raysweep_transport::plane::{RelitBeam, Transport, relight_rows};
+use raysweep_session::{STRIP_ROWS, Session, durable, manifest, transport};
+use raysweep_transport::plane::{PlaneError, RelitBeam, RelitUnknowns, relight_rows};
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 
-use crate::materials::create_new;
 use crate::patterns::{LitImage, PatternsTask, PictureImages};
+use crate::plane::mask_bits;
 use crate::stored::{ProcessError, Stored};
 use crate::sweep::SweepTask;
 
 /// White in pictures: this percentile of the reference.
 const PERCENTILE: f64 = 99.5;
 /// What a session is read by.
-const INPUTS: [&str; 2] = ["plan.toml", "rig.toml"];
+const INPUTS: [&str; 4] = ["plan.toml", "rig.toml", "calibration.toml", "calibration.npz"];
+const TRANSPORT: &str = "transport.zarr/";
 /// Columns between the images of a picture.
 const GAP_PX: usize = 4;
 
@@ -38,6 +39,8 @@ pub struct RelitPicture {
     pub reference: PathBuf,
     /// Light time of the reference.
     pub reference_s: f64,
+    /// Pixels that were compared: those that do not saturate, and whose relit light is measured.
+    pub compared_px: usize,
     /// The relit image first, then the other captures.
     pub images: Vec<RelitImage>,
 }
@@ -51,10 +54,10 @@ pub struct RelitImage {
     pub relit: bool,
     /// Light time of a capture.
     pub light_s: Option<f64>,
-    /// Mean square of the reference over that of the difference, in dB.
-    pub snr_db: f64,
-    /// Square of the reference's largest value over the mean square of the difference, in dB.
-    pub psnr_db: f64,
+    /// Mean square of the reference over that of the difference, in dB; `None` without light or a difference.
+    pub snr_db: Option<f64>,
+    /// Square of the reference's largest value over the mean square of the difference, in dB; `None` as above.
+    pub psnr_db: Option<f64>,
 }
 
 /// The transport of a sweep, and the rows that it belongs to.
@@ -62,6 +65,13 @@ struct Sweep {
     session: Session,
     geometry: SweepGeometry,
     u_min: i32,
+}
+
+/// The scene under a picture.
+struct Relit {
+    image: Array2<f32>,
+    /// The bits of [`mask`].
+    mask: Array2<u8>,
 }
 
 /// An image captured under a picture.
@@ -83,8 +93,14 @@ struct Capture {
 /// When a session cannot be read, is of another kind or another size, or has no picture of rows.
 pub fn relit(sweep: &Path, captures: &[PathBuf], to: &Path) -> Result<Vec<RelitPicture>, ProcessError> {
     let sweep = Sweep::open(sweep)?;
+    let mut seen = Vec::new();
     let mut groups: Vec<Vec<Capture>> = Vec::new();
     for session in captures {
+        let real = std::fs::canonicalize(session).unwrap_or_else(|_| session.clone());
+        if seen.contains(&real) {
+            return Err(wrong(session, "is given twice"));
+        }
+        seen.push(real);
         for capture in captured(session, &sweep.geometry)? {
             match groups.iter_mut().find(|group| group[0].weights == capture.weights) {
                 Some(group) => group.push(capture),
@@ -96,58 +112,92 @@ pub fn relit(sweep: &Path, captures: &[PathBuf], to: &Path) -> Result<Vec<RelitP
         // The reference first; of equal ones, the first given.
         group.sort_by(|a, b| b.light_s.total_cmp(&a.light_s));
     }
-    let relit: Vec<Array2<f32>> =
+    let images: Vec<Relit> =
         groups.iter().map(|group| sweep.relit(&group[0].weights)).collect::<Result<_, _>>()?;
-    create_new(to)?;
-    let products = Products::new(to);
-    let mut pictures = Vec::new();
-    for (k, (group, relit)) in groups.iter().zip(relit).enumerate() {
-        let name = format!("picture_{k}");
-        let (reference, others) = (&group[0], &group[1..]);
-        let is_known = |[t, s]: [usize; 2]| !group.iter().any(|capture| capture.is_clipped[[t, s]]);
-        let compared = |session: &Path, light_s: Option<f64>, image: &Array2<f32>| {
-            let (snr_db, psnr_db) = ratios_db(reference.light.view(), image.view(), is_known);
-            RelitImage { session: session.to_owned(), relit: light_s.is_none(), light_s, snr_db, psnr_db }
-        };
-        let images = std::iter::once(compared(sweep.session.dir(), None, &relit))
-            .chain(others.iter().map(|other| compared(&other.session, Some(other.light_s), &other.light)))
-            .collect();
-        let metadata = Map::from_iter([
-            ("axes".to_owned(), json!(["t", "s"])),
-            ("units".to_owned(), json!("1 is a white pixel under its own row")),
-            ("about".to_owned(), json!(format!("relit by the transport under {}", reference.shows))),
-            ("session".to_owned(), json!(sweep.session.dir())),
-        ]);
-        products.image(&name, relit.view(), &metadata)?;
-        let captures = group.iter().rev().map(|capture| capture.light.view());
-        let shown: Vec<ArrayView2<f32>> = std::iter::once(relit.view()).chain(captures).collect();
-        let white = ToneMap::percentile(&[reference.light.view()], PERCENTILE);
-        durable::write(&to.join(format!("{name}.png")), &side_by_side(&shown, white)?)?;
-        pictures.push(RelitPicture {
-            name,
-            shows: reference.shows.clone(),
-            reference: reference.session.clone(),
-            reference_s: reference.light_s,
-            images,
-        });
+    if to.exists() {
+        return Err(wrong(to, "already exists: give a new folder"));
     }
-    let table = serde_json::to_vec_pretty(&pictures).map_err(|error| wrong(to, error))?;
-    durable::write(&to.join("relit.json"), &table)?;
-    Ok(pictures)
+    durable::replace_dir(to, |draft| {
+        let mut pictures = Vec::new();
+        for (k, (group, relit)) in groups.iter().zip(&images).enumerate() {
+            pictures.push(write(draft, &format!("picture_{k}"), sweep.session.dir(), group, relit)?);
+        }
+        let table = serde_json::to_vec_pretty(&pictures).map_err(|error| wrong(to, error))?;
+        durable::write(&draft.join("relit.json"), &table)?;
+        Ok(pictures)
+    })
+}
+
+/// Writes the images of one picture; the first capture is the reference.
+fn write(
+    folder: &Path,
+    name: &str,
+    sweep: &Path,
+    group: &[Capture],
+    Relit { image, mask }: &Relit,
+) -> Result<RelitPicture, ProcessError> {
+    let (reference, others) = (&group[0], &group[1..]);
+    let is_known = |place: [usize; 2]| {
+        mask[place] & mask::MEASURED != 0 && !group.iter().any(|capture| capture.is_clipped[place])
+    };
+    let compared = |session: &Path, light_s: Option<f64>, image: &Array2<f32>| {
+        let (snr_db, psnr_db) = ratios_db(reference.light.view(), image.view(), is_known);
+        RelitImage { session: session.to_owned(), relit: light_s.is_none(), light_s, snr_db, psnr_db }
+    };
+    let images = std::iter::once(compared(sweep, None, image))
+        .chain(others.iter().map(|other| compared(&other.session, Some(other.light_s), &other.light)))
+        .collect();
+    let metadata = Map::from_iter([
+        ("axes".to_owned(), json!(["t", "s"])),
+        ("units".to_owned(), json!("1 is a white pixel under its own row")),
+        ("about".to_owned(), json!(format!("relit by the transport under {}", reference.shows))),
+        ("mask".to_owned(), mask_bits()),
+        ("session".to_owned(), json!(sweep)),
+    ]);
+    let channels = image.view().insert_axis(Axis(2));
+    Products::new(folder).masked_image(name, channels, mask.view(), &metadata)?;
+    // As in the table, and the reference last.
+    let shown: Vec<ArrayView2<f32>> = std::iter::once(image)
+        .chain(others.iter().map(|other| &other.light))
+        .chain([&reference.light])
+        .map(|image| image.view())
+        .collect();
+    let white = ToneMap::percentile(&[reference.light.view()], PERCENTILE);
+    durable::write(&folder.join(format!("{name}.png")), &side_by_side(&shown, white)?)?;
+    Ok(RelitPicture {
+        name: name.to_owned(),
+        shows: reference.shows.clone(),
+        reference: reference.session.clone(),
+        reference_s: reference.light_s,
+        compared_px: (0..image.nrows())
+            .flat_map(|t| (0..image.ncols()).map(move |s| [t, s]))
+            .filter(|place| is_known(*place))
+            .count(),
+        images,
+    })
 }
 
 fn wrong(dir: &Path, what: impl std::fmt::Display) -> ProcessError {
     ProcessError::Config(format!("{}: {what}", dir.display()))
 }
 
-/// Opens a session of which plan and rig file are sound, and calls `read` with it.
+/// Opens a session, and calls `read` with it.
+///
+/// # Errors
+/// Those of `read`, and if a file is damaged that is read: plan, rig file, calibration, the transport's.
 fn with_stored<T>(
     dir: &Path,
     read: impl FnOnce(&Stored<'_>) -> Result<T, ProcessError>,
 ) -> Result<T, ProcessError> {
     let session = Session::open(dir)?;
     let state = session.state()?;
-    let damage = damaged_files(&session, &state, &INPUTS.map(String::from))?;
+    let mut files = INPUTS.map(String::from).to_vec();
+    // Only the manifest knows which files a transport has.
+    if session.manifest_path().exists() {
+        let recorded = manifest::read(&session)?.files.into_keys();
+        files.extend(recorded.filter(|file| file.starts_with(TRANSPORT)));
+    }
+    let damage = damaged_files(&session, &state, &files)?;
     if !damage.is_empty() {
         let damage = damage.iter().map(ToString::to_string).collect();
         return Err(ProcessError::Damaged { dir: dir.to_owned(), damage, is_edited: false });
@@ -174,32 +224,56 @@ impl Sweep {
             let what = "has no transport.zarr; `raysweep process` makes it once the sweep is complete";
             return Err(wrong(dir, what));
         }
-        let (_, attributes) = transport::describe(&path)?;
+        let ([depth, rows, columns], attributes) = transport::describe(&path)?;
         let u_min = attributes.get("u_min").and_then(Value::as_i64).and_then(|u| i32::try_from(u).ok());
         let u_min = u_min.ok_or_else(|| {
             wrong(dir, "transport.zarr does not say its u_min; `raysweep process` makes it again")
         })?;
+        // Relative rows are less than the projector has.
+        let last = u_min.checked_add(i32::try_from(depth).unwrap_or(i32::MAX));
+        let reach = i32::try_from(geometry.raster.rows).unwrap_or(i32::MAX);
+        let is_sound = u_min > -reach && last.is_some_and(|last| last <= reach);
+        if !is_sound || (rows, columns) != (geometry.height, geometry.width) {
+            let what = format!(
+                "transport.zarr has {depth} x {rows} x {columns} values from u = {u_min} on, which do not fit the rig; `raysweep process` makes it again"
+            );
+            return Err(wrong(dir, what));
+        }
         // As the sweep found it, if the rig file does not state it.
         let found_rows = attributes.get("beam_sigma_rows").and_then(Value::as_f64);
         geometry.beam_sigma_rows = found_rows.or(geometry.beam_sigma_rows);
         Ok(Self { session, geometry, u_min })
     }
 
-    /// The scene under these weights of the projector's rows, `[t, s]`.
-    fn relit(&self, weights: &Array1<f64>) -> Result<Array2<f32>, ProcessError> {
-        let dir = self.session.dir();
-        let timing = self.geometry.timing().map_err(|error| wrong(dir, error))?;
+    /// The scene under these weights of the projector's rows.
+    fn relit(&self, weights: &Array1<f64>) -> Result<Relit, ProcessError> {
+        let (dir, path) = (self.session.dir(), self.session.transport_path());
+        let refused = |error: PlaneError| wrong(dir, error);
+        let timing = self.geometry.timing().map_err(refused)?;
         let (height, width) = (self.geometry.height, self.geometry.width);
         let mut image = Array2::zeros((height, width));
+        let mut mask = Array2::from_elem((height, width), mask::MEASURED);
         for first in (0..height).step_by(STRIP_ROWS) {
             let end = (first + STRIP_ROWS).min(height);
-            let t = transport::read_rows(&self.session.transport_path(), first..end)?;
-            let exists = Array2::from_elem((t.len_of(Axis(0)), end - first), true);
-            let transport = Transport::measured(t, self.u_min, exists);
+            let t = transport::read_rows(&path, first..end)?;
+            let bits = transport::read_mask_rows(&path, first..end)?;
+            let bits = bits.unwrap_or_else(|| Array3::from_elem(t.dim(), mask::MEASURED));
+            let transport = mask::stored_transport(t, self.u_min, bits.view());
             let part = relight_rows(&timing, first, &transport, weights.view(), RelitBeam::AsLit);
-            image.slice_mut(s![first..end, ..]).assign(&part.map_err(|error| wrong(dir, error))?);
+            image.slice_mut(s![first..end, ..]).assign(&part.map_err(refused)?);
+            let RelitUnknowns { is_bound, is_beyond } =
+                RelitUnknowns::of(&timing, first, &transport, weights.view(), RelitBeam::AsLit)
+                    .map_err(refused)?;
+            for (place, bits) in mask.slice_mut(s![first..end, ..]).indexed_iter_mut() {
+                if is_bound[place] {
+                    *bits = mask::BOUND_ONLY;
+                }
+                if is_beyond[place] {
+                    *bits |= mask::OUTSIDE_REACH;
+                }
+            }
         }
-        Ok(image)
+        Ok(Relit { image, mask })
     }
 }
 
@@ -216,13 +290,16 @@ fn captured(dir: &Path, sweep: &SweepGeometry) -> Result<Vec<Capture>, ProcessEr
         let task = PatternsTask::new(stored.plan, own, &stored.known(&rig)?)
             .map_err(|error| stored.in_plan(&error))?;
         let geometry = &task.task.geometry;
-        let size = |geometry: &SweepGeometry| [geometry.raster.rows, geometry.height, geometry.width];
-        if size(geometry) != size(sweep) {
-            let what = format!(
-                "has {:?} projector rows, camera rows and columns, the sweep {:?}: take both with the same rig and region",
-                size(geometry),
-                size(sweep)
-            );
+        let seen = |geometry: &SweepGeometry| {
+            let SweepGeometry { raster, height, width, first_row, row_pitch, .. } = geometry;
+            format!(
+                "{} projector rows of {} µs, of which {height} rows and {width} columns of the camera see row {first_row} on, {row_pitch} apart",
+                raster.rows, raster.row_time_us
+            )
+        };
+        if seen(geometry) != seen(sweep) {
+            let (own, others) = (seen(geometry), seen(sweep));
+            let what = format!("has {own}, the sweep {others}: take both with the same rig and region");
             return Err(wrong(dir, what));
         }
         let (rows, stack) = (geometry.raster.rows, stored.session.stack()?);
@@ -256,12 +333,12 @@ fn captured(dir: &Path, sweep: &SweepGeometry) -> Result<Vec<Capture>, ProcessEr
     })
 }
 
-/// SNR and PSNR of an image in dB, against a reference; over the pixels that are known.
+/// SNR and PSNR of an image in dB, against a reference; over the pixels that are known. `None` without light or a difference.
 fn ratios_db(
     reference: ArrayView2<f32>,
     image: ArrayView2<f32>,
     is_known: impl Fn([usize; 2]) -> bool,
-) -> (f64, f64) {
+) -> (Option<f64>, Option<f64>) {
     let (mut signal, mut error, mut peak, mut pixels) = (0.0, 0.0, 0.0_f64, 0.0);
     for ((place, &reference), &image) in reference.indexed_iter().zip(&image) {
         let (reference, image) = (f64::from(reference), f64::from(image));
@@ -272,7 +349,8 @@ fn ratios_db(
             pixels += 1.0;
         }
     }
-    (10.0 * (signal / error).log10(), 10.0 * (peak * peak * pixels / error).log10())
+    let db = |ratio: f64| Some(10.0 * ratio.log10()).filter(|db| db.is_finite());
+    (db(signal / error), db(peak * peak * pixels / error))
 }
 
 /// A PNG file of images of one size.
@@ -299,6 +377,7 @@ mod tests {
         let reference = arr2(&[[3.0, 4.0], [0.0, 9.0]]);
         let image = arr2(&[[3.1, 4.0], [-0.1, 1.0]]);
         let (snr_db, psnr_db) = ratios_db(reference.view(), image.view(), |[t, s]| (t, s) != (1, 1));
+        let (snr_db, psnr_db) = (snr_db.unwrap(), psnr_db.unwrap());
         // 25 over 0.02, and 16 times three pixels over 0.02.
         assert!((snr_db - 30.969).abs() < 1e-3 && (psnr_db - 33.802).abs() < 1e-3, "{snr_db} {psnr_db}");
     }

@@ -1,10 +1,17 @@
 //! Video files from the pictures of products.
 
+use std::ffi::OsStr;
 use std::io::ErrorKind;
 use std::path::Path;
 use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
 
 use raysweep_session::{Result, durable};
+
+/// Longer than any video takes.
+const LIMIT: Duration = Duration::from_secs(1800);
+/// How often it is looked whether ffmpeg has ended.
+const LOOK: Duration = Duration::from_millis(20);
 
 /// Encodes PNG sequences as video files, where ffmpeg is installed.
 #[derive(Default)]
@@ -14,44 +21,116 @@ pub(crate) struct Encoder {
 }
 
 impl Encoder {
-    /// Encodes the PNG sequence of a video among the products as `NAME.mp4`.
+    /// Encodes the PNG sequence of a video among the products as `NAME.mp4`; breaks it off soon after `go_on` returns false.
     ///
     /// # Errors
-    /// When the file cannot be moved into place.
-    pub fn encode(&mut self, products: &Path, name: &str, images_per_s: f64) -> Result<()> {
+    /// When the file cannot be moved into place, or an older one cannot be removed.
+    pub fn encode(
+        &mut self,
+        products: &Path,
+        name: &str,
+        images_per_s: f64,
+        go_on: &dyn Fn() -> bool,
+    ) -> Result<()> {
         let target = products.join(format!("{name}.mp4"));
-        durable::write_by(&target, |draft| match encode_to(draft, &products.join(name), images_per_s) {
-            Ok(()) => true,
-            Err(problem) => {
-                if !self.problems.contains(&problem) {
-                    self.problems.push(problem);
+        // If this one fails, nobody shall take an older one for it.
+        durable::remove(&target)?;
+        durable::write_by(&target, |draft| {
+            match encode_to(draft, &products.join(name), images_per_s, go_on) {
+                Ok(()) => true,
+                Err(problem) => {
+                    if !self.problems.contains(&problem) {
+                        self.problems.push(problem);
+                    }
+                    false
                 }
-                false
             }
         })
     }
 }
 
 /// Encodes the images of a folder as one file; the error says why not.
-fn encode_to(target: &Path, images: &Path, images_per_s: f64) -> std::result::Result<(), String> {
+fn encode_to(
+    target: &Path,
+    images: &Path,
+    images_per_s: f64,
+    go_on: &dyn Fn() -> bool,
+) -> std::result::Result<(), String> {
+    encode_by("ffmpeg".as_ref(), target, images, images_per_s, go_on)
+}
+
+/// [`encode_to`] by a program that takes ffmpeg's arguments.
+fn encode_by(
+    ffmpeg: &OsStr,
+    target: &Path,
+    images: &Path,
+    images_per_s: f64,
+    go_on: &dyn Fn() -> bool,
+) -> std::result::Result<(), String> {
     let failed = |what: String| {
         let name = images.file_name().unwrap_or_default().to_string_lossy();
         format!("ffmpeg could not make {name}.mp4: {what}")
     };
-    let ended = Command::new("ffmpeg")
-        .args(["-y", "-loglevel", "error", "-framerate", &format!("{images_per_s:.4}"), "-i"])
-        .arg(images.join("%04d.png"))
+    let target = std::path::absolute(target).map_err(|error| failed(error.to_string()))?;
+    let started = Command::new(ffmpeg)
+        // A path would be taken for a pattern or an option.
+        .current_dir(images)
+        .args(["-y", "-loglevel", "error", "-framerate", &format!("{images_per_s:.4}"), "-i", "%04d.png"])
         // Players need even sides and half-resolution chroma.
         .args(["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-c:v", "libx264", "-pix_fmt", "yuv420p"])
         // The temporary file's name does not say the format.
         .args(["-f", "mp4"])
-        .arg(target)
+        .arg(format!("file:{}", target.display()))
         .stdin(Stdio::null())
-        .output();
-    match ended {
+        .stdout(Stdio::null())
+        .stderr(Stdio::piped())
+        .spawn();
+    let mut ffmpeg = match started {
+        Ok(ffmpeg) => ffmpeg,
+        Err(error) if error.kind() == ErrorKind::NotFound => {
+            return Err("ffmpeg is not installed, so there are only PNG sequences and no video files: install it and run `raysweep process`".into());
+        }
+        Err(error) => return Err(failed(error.to_string())),
+    };
+    let began = Instant::now();
+    loop {
+        match ffmpeg.try_wait() {
+            Ok(None) if go_on() && began.elapsed() < LIMIT => std::thread::sleep(LOOK),
+            Ok(Some(_)) => break,
+            Ok(None) | Err(_) => {
+                // Nothing is left of it if it has ended meanwhile.
+                let _ = ffmpeg.kill();
+                let _ = ffmpeg.wait();
+                let why = if go_on() { format!("it took more than {LIMIT:?}") } else { "broken off".into() };
+                return Err(failed(why));
+            }
+        }
+    }
+    match ffmpeg.wait_with_output() {
         Ok(output) if output.status.success() => Ok(()),
         Ok(output) => Err(failed(String::from_utf8_lossy(&output.stderr).trim().to_owned())),
-        Err(error) if error.kind() == ErrorKind::NotFound => Err("ffmpeg is not installed, so there are only PNG sequences and no video files: install it and run `raysweep process`".into()),
         Err(error) => Err(failed(error.to_string())),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
+    use super::*;
+
+    #[test]
+    fn a_program_that_hangs_is_broken_off() {
+        let folder = tempfile::tempdir().unwrap();
+        let program = folder.path().join("sleeps");
+        std::fs::write(&program, "#!/bin/sh\nexec sleep 1000\n").unwrap();
+        std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
+        let looks = std::cell::Cell::new(0);
+        let go_on = || {
+            looks.set(looks.get() + 1);
+            looks.get() < 3
+        };
+        let said = encode_by(program.as_os_str(), &folder.path().join("x.mp4"), folder.path(), 1.0, &go_on);
+        assert!(said.unwrap_err().ends_with("broken off"));
     }
 }

@@ -47,6 +47,10 @@ pub struct ViewfinderValues {
     pub saturation_dn: f64,
     /// Largest count of the camera's format.
     pub full_dn: u16,
+    /// Counts above black of a white pixel under its own row, as the calibration or else the rig file has it; `None` on a
+    /// dot rig.
+    #[serde(default)]
+    pub white_dn: Option<f64>,
     /// Share of saturated pixels.
     pub saturated: f64,
     /// Share of pixels with less than 2 % of the range from black to saturation.

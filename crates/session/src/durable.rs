@@ -122,6 +122,22 @@ pub fn replace_dir<T, E: From<Error>>(
     Ok(filled)
 }
 
+/// Removes a file or folder, if it is there.
+///
+/// # Errors
+/// [`Error::Io`].
+pub fn remove(path: &Path) -> Result<()> {
+    let removed = match fs::symlink_metadata(path) {
+        Ok(found) if found.is_dir() => fs::remove_dir_all(path),
+        Ok(_) => fs::remove_file(path),
+        Err(error) => Err(error),
+    };
+    match removed {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(Error::io("remove", path)(error)),
+        _ => Ok(()),
+    }
+}
+
 /// Calls `work` with an empty folder next to `path`, which is removed afterwards; one that a crash left behind is
 /// replaced.
 ///

@@ -13,7 +13,7 @@ use std::io::{self, BufWriter};
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
-use ndarray::{Array2, ArrayD, ArrayRef, ArrayView2, ArrayView3, ArrayViewD, Axis, Dimension};
+use ndarray::{Array2, ArrayD, ArrayRef, ArrayView2, ArrayView3, ArrayView4, ArrayViewD, Axis, Dimension};
 use ndarray_npy::{ViewNpyExt, WritableElement, WriteNpyExt};
 use raysweep_core::{NpyHeader, io_text};
 use serde_json::{Map, Value};
@@ -28,6 +28,9 @@ mod volume;
 
 /// Most values of an image that is read by itself: 4096 x 4096 pixels.
 const MOST_IMAGE_VALUES: usize = 1 << 24;
+
+/// The EXR channels of an image in colour.
+const RGB: [&str; 3] = ["R", "G", "B"];
 
 /// The folder of the products.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -61,22 +64,27 @@ impl Products {
         self.write_array(name, &values, metadata)
     }
 
-    /// [`Products::image`] with a mask `[t, s]`, which is the EXR file's channel `mask` and `name_mask.npy` (uint8);
-    /// `metadata` should name its bits.
+    /// Writes an image `[t, s, channels]` with one or three channels as [`Products::image`] or [`Products::rgb`], with a
+    /// mask `[t, s]`, which is the EXR file's channel `mask` and `name_mask.npy` (uint8); `metadata` should name its bits.
     ///
     /// # Errors
     /// [`Error::Shape`] if the mask is not as large as the image; otherwise as [`Products::image`].
     pub fn masked_image(
         &self,
         name: &str,
-        values: ArrayView2<f32>,
+        values: ArrayView3<f32>,
         mask: ArrayView2<u8>,
         metadata: &Map<String, Value>,
     ) -> Result<()> {
-        let shown = self.write_mask(name, mask, values.shape())?;
-        let channels = [("Y", values), ("mask", shown.view())];
-        self.write(name, "exr", &exr_file::encode(&channels, metadata)?)?;
-        self.write_array(name, &values, metadata)
+        let names = channels(name, values.shape())?;
+        let shown = self.write_mask(name, mask, &values.shape()[..2])?;
+        let mut planes: Vec<_> = names.iter().copied().zip(values.axis_iter(Axis(2))).collect();
+        planes.push(("mask", shown.view()));
+        self.write(name, "exr", &exr_file::encode(&planes, metadata)?)?;
+        match names {
+            [_] => self.write_array(name, &values.index_axis(Axis(2), 0), metadata),
+            _ => self.write_array(name, &values, metadata),
+        }
     }
 
     /// Writes a colour image `[t, s, 3]` (R, G, B) as `name.exr`, `name.npy` and `name.json`.
@@ -84,13 +92,28 @@ impl Products {
     /// # Errors
     /// [`Error::Shape`] if the last axis is not 3; otherwise as [`Products::image`].
     pub fn rgb(&self, name: &str, values: ArrayView3<f32>, metadata: &Map<String, Value>) -> Result<()> {
-        let channels: Vec<_> = ["R", "G", "B"].into_iter().zip(values.axis_iter(Axis(2))).collect();
         if values.shape()[2] != 3 {
             let found = values.shape().to_vec();
             return Err(Error::Shape { what: format!("image `{name}`"), found, allowed: "[t, s, 3]".into() });
         }
-        self.write(name, "exr", &exr_file::encode(&channels, metadata)?)?;
+        let planes: Vec<_> = RGB.into_iter().zip(values.axis_iter(Axis(2))).collect();
+        self.write(name, "exr", &exr_file::encode(&planes, metadata)?)?;
         self.write_array(name, &values, metadata)
+    }
+
+    /// Removes what an earlier product of this name and of another kind has left: its files with other endings than these,
+    /// of which `_mask.npy` and the empty one of a folder count as such.
+    ///
+    /// # Errors
+    /// [`Error::Codec`] for a name that is not a plain file name, [`Error::Io`].
+    pub fn remove_others(&self, name: &str, kept: &[&str]) -> Result<()> {
+        let path = self.path(name, "npy")?;
+        for ending in [".exr", ".csv", ".mp4", "_mask.npy", ""] {
+            if !kept.contains(&ending) {
+                durable::remove(&path.with_file_name(format!("{name}{ending}")))?;
+            }
+        }
+        Ok(())
     }
 
     /// Writes a volume as `name.npy` (C order) and `name.json`, which should name the axes.
@@ -131,42 +154,51 @@ impl Products {
         layers: &[String],
         metadata: &Map<String, Value>,
     ) -> Result<()> {
-        self.layers(name, values, layers, None, metadata)
+        self.layers(name, values.insert_axis(Axis(3)), layers, None, metadata)
     }
 
     fn layers(
         &self,
         name: &str,
-        values: ArrayView3<f32>,
+        values: ArrayView4<f32>,
         layers: &[String],
         mask: Option<ArrayView2<f32>>,
         metadata: &Map<String, Value>,
     ) -> Result<()> {
+        let names = channels(name, values.shape())?;
         if values.shape()[0] != layers.len() {
             let (found, allowed) = (values.shape().to_vec(), format!("[{}, t, s]", layers.len()));
             return Err(Error::Shape { what: format!("sequence `{name}`"), found, allowed });
         }
-        let names: Vec<String> = layers.iter().map(|layer| format!("{layer}.Y")).collect();
-        let mut channels: Vec<_> = names.iter().map(String::as_str).zip(values.outer_iter()).collect();
-        channels.extend(mask.map(|mask| ("mask", mask)));
-        self.write(name, "exr", &exr_file::encode(&channels, metadata)?)?;
-        self.write_array(name, &values, metadata)
+        let layered = layers.iter().flat_map(|layer| names.iter().map(move |name| format!("{layer}.{name}")));
+        let layered: Vec<String> = layered.collect();
+        let images = values.outer_iter().flat_map(|image| {
+            (0..names.len()).map(move |channel| image.index_axis_move(Axis(2), channel)).collect::<Vec<_>>()
+        });
+        let mut planes: Vec<_> = layered.iter().map(String::as_str).zip(images).collect();
+        planes.extend(mask.map(|mask| ("mask", mask)));
+        self.write(name, "exr", &exr_file::encode(&planes, metadata)?)?;
+        match names {
+            [_] => self.write_array(name, &values.index_axis(Axis(3), 0), metadata),
+            _ => self.write_array(name, &values, metadata),
+        }
     }
 
-    /// [`Products::sequence`] with one mask for all images, as in [`Products::masked_image`], and with pictures:
-    /// `NAME/0000.png` and so on, and `NAME/contact_sheet.png`.
+    /// Writes images `[k, t, s, channels]` as [`Products::sequence`] does, of three channels as layers with R, G, B and
+    /// `[k, t, s, 3]`; with one mask for all images, as in [`Products::masked_image`], and with pictures: `NAME/0000.png`
+    /// and so on, and `NAME/contact_sheet.png`.
     ///
     /// # Errors
     /// As [`Products::sequence`] and [`Products::masked_image`].
     pub fn masked_sequence(
         &self,
         name: &str,
-        values: ArrayView3<f32>,
+        values: ArrayView4<f32>,
         layers: &[String],
         mask: ArrayView2<u8>,
         metadata: &Map<String, Value>,
     ) -> Result<()> {
-        let shown = self.write_mask(name, mask, &values.shape()[1..])?;
+        let shown = self.write_mask(name, mask, &values.shape()[1..3])?;
         self.layers(name, values, layers, Some(shown.view()), metadata)?;
         self.write_pictures(name, values)
     }
@@ -278,7 +310,8 @@ impl Products {
         Ok((image, *images))
     }
 
-    /// The files of all products, by path; those of a video are in a folder of their own. Symbolic links are left out.
+    /// The files of all products, by path; those of a video and the pictures of a sequence are in a
+    /// folder of their own. Symbolic links are left out.
     pub fn files(&self) -> Vec<PathBuf> {
         fn below(dir: &Path, files: &mut Vec<PathBuf>) {
             for entry in std::fs::read_dir(dir).into_iter().flatten().flatten() {
@@ -352,6 +385,19 @@ impl Products {
             ));
         }
         Ok(self.dir.join(format!("{name}.{extension}")))
+    }
+}
+
+/// The EXR channels of images whose last axis has this length.
+fn channels(name: &str, shape: &[usize]) -> Result<&'static [&'static str]> {
+    match shape.last() {
+        Some(1) => Ok(&["Y"]),
+        Some(3) => Ok(&RGB),
+        _ => Err(Error::Shape {
+            what: format!("product `{name}`"),
+            found: shape.to_vec(),
+            allowed: "a last axis of one or three channels".into(),
+        }),
     }
 }
 

@@ -204,6 +204,19 @@ pub fn read_rows(dir: &Path, rows: Range<usize>) -> Result<Array3<f32>> {
     zarr::read_part(&array, [0..length(0), rows, 0..length(2)])
 }
 
+/// Reads what is known of some camera rows of the transport, `[u, t, s]`; `None` if it was written without.
+///
+/// # Errors
+/// As [`read_rows`].
+pub fn read_mask_rows(dir: &Path, rows: Range<usize>) -> Result<Option<Array3<u8>>> {
+    if !dir.join(MASK).is_dir() {
+        return Ok(None);
+    }
+    let array = zarr::open_array(&DurableStore::new(dir)?, MASK, 3)?;
+    let length = |axis: usize| array.shape()[axis] as usize;
+    zarr::read_part(&array, [0..length(0), rows, 0..length(2)]).map(Some)
+}
+
 /// Reads `transport [u, t, s]` and its attributes.
 ///
 /// # Errors

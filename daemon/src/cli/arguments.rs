@@ -274,7 +274,7 @@ pub enum Command {
         to: PathBuf,
     },
     /// Relight a scene by the transport of a sweep, beside captures of it under the same pictures of rows, and tell by how
-    /// much they differ
+    /// much they differ; needs no daemon, unless sessions are given by name
     Relit {
         /// The sweep's folder, or its name within the daemon's data folder
         sweep: PathBuf,

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use ndarray::{Array2, Axis, concatenate, stack};
+use ndarray::{Array2, Array3, Axis, concatenate, stack};
 use raysweep_core::Counts;
 use raysweep_processing::ProcessError;
 use raysweep_session::Session;
@@ -41,13 +41,13 @@ pub(super) struct Compared {
     pub picture: Option<PictureOfDifference>,
 }
 
-/// The difference of an image, B - A, over the pixels that are numbers in both.
+/// The difference of an image, B - A, over the values that are numbers in both.
 #[derive(Debug, Serialize, PartialEq)]
 struct Difference {
-    /// Pixels that are numbers in both.
+    /// Values that are numbers in both.
     compared: usize,
-    /// Pixels of the image.
-    pixels: usize,
+    /// Values of the image: one for each pixel, or three in colour.
+    values: usize,
     /// Root mean square of the first image.
     rms: f64,
     /// Root mean square of the difference.
@@ -137,7 +137,7 @@ impl Compared {
 }
 
 impl Difference {
-    fn of(a: &Array2<f32>, b: &Array2<f32>) -> Self {
+    fn of(a: &Array3<f32>, b: &Array3<f32>) -> Self {
         let pairs = || {
             let pairs = a.iter().zip(b).map(|(a, b)| (f64::from(*a), f64::from(*b)));
             pairs.filter(|(a, b)| a.is_finite() && b.is_finite())
@@ -150,7 +150,7 @@ impl Difference {
         let difference = |(a, b)| b - a;
         Self {
             compared,
-            pixels: a.len(),
+            values: a.len(),
             rms: rms(|(a, _)| a),
             rms_difference: rms(difference),
             largest: pairs().map(difference).fold(
@@ -163,14 +163,14 @@ impl Difference {
     }
 
     fn text(&self) -> String {
-        let Self { compared, pixels, rms, rms_difference, largest } = self;
+        let Self { compared, values, rms, rms_difference, largest } = self;
         if *compared == 0 {
-            return "no pixel is a number in both".into();
+            return "no value is a number in both".into();
         }
         let share =
             if *rms > 0.0 { format!(" ({:.2} %)", 100.0 * rms_difference / rms) } else { String::new() };
-        let of = if compared < pixels {
-            format!("; over the {compared} of {pixels} pixels that are numbers in both")
+        let of = if compared < values {
+            format!("; over the {compared} of {values} values that are numbers in both")
         } else {
             String::new()
         };
@@ -217,7 +217,7 @@ pub(super) fn write_picture_of_difference(
             ))
         })
     });
-    let (a, b) = (a?, b?);
+    let (a, b) = (grey(&a?), grey(&b?));
     if a.dim() != b.dim() {
         let message =
             format!("{product} has {:?} pixels in one session and {:?} in the other", a.dim(), b.dim());
@@ -280,20 +280,32 @@ pub(super) fn changes(before: &Path, after: &Path) -> Result<Vec<String>, Comman
     Ok(found)
 }
 
-/// An image among a session's products.
-fn image(dir: &Path, name: &str) -> Option<Array2<f32>> {
-    Session::open(dir).ok()?.products().read_image(name).ok()
+/// An image `[t, s, channels]` with one or three channels among a session's products.
+fn image(dir: &Path, name: &str) -> Option<Array3<f32>> {
+    let array = Session::open(dir).ok()?.products().read_array(name).ok()?;
+    match array.ndim() {
+        2 => array.insert_axis(Axis(2)),
+        _ => array,
+    }
+    .into_dimensionality()
+    .ok()
+    .filter(|image: &Array3<f32>| [1, 3].contains(&image.len_of(Axis(2))))
+}
+
+/// An image of which all channels are one.
+fn grey(image: &Array3<f32>) -> Array2<f32> {
+    image.sum_axis(Axis(2)) / image.len_of(Axis(2)) as f32
 }
 
 #[cfg(test)]
 mod tests {
-    use ndarray::arr2;
+    use ndarray::arr3;
 
     use super::*;
 
     #[test]
     fn the_difference_of_images_is_that_of_their_pixels() {
-        let (a, b) = (arr2(&[[3.0, 4.0]]), arr2(&[[3.0, 1.0]]));
+        let (a, b) = (arr3(&[[[3.0], [4.0]]]), arr3(&[[[3.0], [1.0]]]));
         let found = Difference::of(&a, &b);
         assert_eq!((found.rms, found.rms_difference, found.largest), (12.5_f64.sqrt(), 4.5_f64.sqrt(), -3.0));
         assert_eq!(found.text(), "RMS of B - A 2.121e0 (60.00 %), at most -3.000e0");
@@ -301,11 +313,11 @@ mod tests {
 
     #[test]
     fn pixels_that_are_no_numbers_are_not_compared() {
-        let (a, b) = (arr2(&[[f32::NAN, 4.0, 1.0]]), arr2(&[[3.0, 1.0, f32::INFINITY]]));
+        let (a, b) = (arr3(&[[[f32::NAN, 4.0, 1.0]]]), arr3(&[[[3.0, 1.0, f32::INFINITY]]]));
         let found = Difference::of(&a, &b);
         assert_eq!((found.rms, found.rms_difference, found.largest), (4.0, 3.0, -3.0));
-        assert!(found.text().ends_with("; over the 1 of 3 pixels that are numbers in both"));
-        let none = Difference::of(&arr2(&[[f32::NAN]]), &arr2(&[[1.0]]));
-        assert_eq!(none.text(), "no pixel is a number in both");
+        assert!(found.text().ends_with("; over the 1 of 3 values that are numbers in both"));
+        let none = Difference::of(&arr3(&[[[f32::NAN]]]), &arr3(&[[[1.0]]]));
+        assert_eq!(none.text(), "no value is a number in both");
     }
 }

@@ -28,6 +28,8 @@ const PICTURES: u64 = 8;
 const CONFIDENCE: f64 = 1.6;
 /// A scene that could be this much brighter is worth opening the aperture for.
 const WORTHWHILE: f64 = 1.1;
+/// Most of a camera's full scale that a calibration takes of a white board.
+const MOST_OF_BOARD: f64 = 0.65;
 /// Edges nearer to the pixel's own row than this share of the exposure divide the light about it.
 const NEAR_EDGES: f64 = 0.15;
 /// Averaging over more frames is not proposed.
@@ -281,7 +283,7 @@ impl Trial {
             let pixels = values.histogram.iter().sum::<u64>() as f64;
             samples += pixels;
             saturated += values.saturated * pixels;
-            headroom = headroom.min(headroom_of(&values));
+            headroom = headroom.min(headroom_of(&values)).min(headroom_of_board(&values));
         }
         let suits =
             saturated == 0.0 || saturated + CONFIDENCE * (saturated + 1.0).sqrt() <= MAX_SATURATED * samples;
@@ -369,6 +371,12 @@ fn headroom_of(values: &ViewfinderValues) -> f64 {
     (values.saturation_dn - values.black_dn) / (level_dn - values.black_dn).max(1.0)
 }
 
+/// By how much the light could grow until a white board has more than a calibration takes.
+fn headroom_of_board(values: &ViewfinderValues) -> f64 {
+    let most_dn = MOST_OF_BOARD * f64::from(values.full_dn) - values.black_dn;
+    values.white_dn.map_or(f64::INFINITY, |white_dn| most_dn / white_dn)
+}
+
 /// What is proposed.
 struct Proposed {
     tried: Tried,
@@ -403,7 +411,7 @@ impl Proposed {
         }
         if *headroom > WORTHWHILE {
             head.push(format!(
-                "the scene may be {headroom:.2} times as bright, as long as a white board has at most 65 % of full scale, which a calibration needs: open the aperture, or raise the gain, calibrate again, and try this again"
+                "the scene may be {headroom:.2} times as bright, and a white board has at most 65 % of full scale then, which a calibration needs: open the aperture, or raise the gain, calibrate again, and try this again"
             ));
         }
         if let Some(average) = average {
@@ -463,6 +471,7 @@ mod tests {
             black_dn: 64.0,
             saturation_dn: 3964.0,
             full_dn: 4095,
+            white_dn: None,
             saturated: 0.0,
             underexposed: 0.0,
             mean_dn: 0.0,
@@ -483,5 +492,9 @@ mod tests {
         assert!((headroom_of(&values) - of(41.0 / 64.0 * 4095.0)).abs() < 1e-9);
         values.brightest_dn = 2000;
         assert!((headroom_of(&values) - of(2000.0)).abs() < 1e-9);
+        // The simulated rig's white board has 58 % of full scale.
+        assert_eq!(headroom_of_board(&values), f64::INFINITY);
+        values.white_dn = Some(2300.0);
+        assert!((headroom_of_board(&values) - 1.1295).abs() < 1e-4);
     }
 }

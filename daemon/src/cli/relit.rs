@@ -24,14 +24,18 @@ pub(super) fn compare(
     Ok(())
 }
 
-fn text(RelitPicture { name, shows, reference_s, images, .. }: &RelitPicture) -> String {
+fn text(RelitPicture { name, shows, reference_s, compared_px, images, .. }: &RelitPicture) -> String {
     let line = |RelitImage { light_s, snr_db, psnr_db, .. }: &RelitImage| {
         let what = match light_s {
             Some(light_s) => format!("captured in {light_s:.3} s"),
             None => "relit".to_owned(),
         };
-        format!("  {what}: SNR {snr_db:.1} dB, PSNR {psnr_db:.1} dB")
+        match snr_db.zip(*psnr_db) {
+            Some((snr_db, psnr_db)) => format!("  {what}: SNR {snr_db:.1} dB, PSNR {psnr_db:.1} dB"),
+            None => format!("  {what}: no light, or no difference"),
+        }
     };
-    let head = format!("{name}, {shows}, against the capture of {reference_s:.3} s:");
+    let head =
+        format!("{name}, {shows}, against the capture of {reference_s:.3} s, over {compared_px} pixels:");
     std::iter::once(head).chain(images.iter().map(line)).collect::<Vec<_>>().join("\n")
 }

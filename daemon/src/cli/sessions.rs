@@ -173,8 +173,8 @@ impl SessionView {
             remarks,
             report: report.exists().then_some(report),
             products: with_ending("npy"),
-            // Of a video, the first.
             videos: with_ending("mp4"),
+            // Of a video or a sequence, the first.
             pictures: with_ending("png").into_iter().filter(|path| path.ends_with("0000.png")).collect(),
             thumbnails: Vec::new(),
         })

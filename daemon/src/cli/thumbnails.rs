@@ -17,7 +17,7 @@ const MOST_PICTURE_BYTES: u64 = (4 << 24) + (1 << 16);
 /// Largest description of a product.
 const MOST_ABOUT_BYTES: u64 = 1 << 24;
 /// Pictures that say most of a session, best first.
-const BEST: [&str; 3] = ["epipolar", "regular", "floodlit"];
+const BEST: [&str; 4] = ["epipolar", "regular", "floodlit", "direct"];
 /// The brightest half per cent of the pixels is white.
 const WHITE_PERCENT: f64 = 99.5;
 

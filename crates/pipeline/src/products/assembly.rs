@@ -74,6 +74,7 @@ impl Assembly {
                 Some(image) => Product::Image {
                     name,
                     about: "a captured exposure of one whole VSYNC period: every row lit once".into(),
+                    is_light: true,
                     image: image.clone(),
                     mask,
                 },
@@ -86,7 +87,10 @@ impl Assembly {
             ProductKind::NonEpipolar(width) => width.of(stack.one_band).non_epipolar(name, transport, mask),
             ProductKind::Band(band) => band.of(stack.one_band).make(name, transport, mask),
             ProductKind::Bands(bands) => {
-                bands.make(name, stack.timing.row_time_us(), stack.one_band, transport, mask)
+                let timing = &stack.timing;
+                let lit_us = timing.row_starts_us().last().copied().unwrap_or_default();
+                let row_time_us = lit_us / timing.projector_rows() as f64;
+                bands.make(name, row_time_us, stack.one_band, transport, mask)
             }
             ProductKind::Captured(captured) => captured.make(name, stack, mask).map_err(not_made)?,
             ProductKind::CrossSection(cut) => {
@@ -128,7 +132,7 @@ impl Assembly {
             return Ok(first);
         }
         Ok(match first {
-            Product::Image { name, about, image, mask } => {
+            Product::Image { name, about, is_light, image, mask } => {
                 let rest = parts.filter_map(|part| match part {
                     Product::Image { image, mask, .. } => Some((image.insert_axis(Axis(0)), mask)),
                     _ => None,
@@ -136,7 +140,7 @@ impl Assembly {
                 let (images, masks) = rest.unzip();
                 let image =
                     one_below_the_other(image.insert_axis(Axis(0)), images).index_axis_move(Axis(0), 0);
-                Product::Image { name, about, image, mask: one_mask_below_the_other(mask, masks) }
+                Product::Image { name, about, is_light, image, mask: one_mask_below_the_other(mask, masks) }
             }
             Product::Sequence { name, about, axis, at, images, mask } => {
                 let rest = parts.filter_map(|part| match part {

@@ -92,7 +92,7 @@ impl Width {
                 format!("light from the pixel's own projector row and {half} to either side (|u| <= {half})")
             }
         };
-        Product::Image { name, about, image: transport.epipolar(self.width_rows), mask }
+        Product::Image { name, about, is_light: true, image: transport.epipolar(self.width_rows), mask }
     }
 
     pub(super) fn non_epipolar(self, name: String, transport: &Transport, mask: Array2<u8>) -> Product {
@@ -102,7 +102,7 @@ impl Width {
                 format!("light from all rows more than {half} away within the sweep's reach (|u| > {half})")
             }
         };
-        Product::Image { name, about, image: transport.non_epipolar(self.width_rows), mask }
+        Product::Image { name, about, is_light: true, image: transport.non_epipolar(self.width_rows), mask }
     }
 }
 
@@ -206,7 +206,7 @@ impl Band {
         if self.to_rows.is_none_or(|to_rows| to_rows > known) {
             about.push_str(&format!("; {}", reach_of(transport)));
         }
-        Product::Image { name, about, image: self.image(transport), mask }
+        Product::Image { name, about, is_light: true, image: self.image(transport), mask }
     }
 
     /// The relative rows, without duplicates.

@@ -69,12 +69,13 @@ impl Bands {
         self.from_rows - half..=self.to_rows + half
     }
 
-    /// Why a sweep of this reach sees none of the rows.
+    /// Why a sweep of this reach sees nothing of some bands.
     pub(super) fn beyond(self, first: i32, last: i32) -> Option<String> {
-        let rows = self.range();
-        (*rows.end() < first || *rows.start() > last).then(|| {
+        let half = self.width_rows / 2;
+        let last_middle = self.middles().last().unwrap_or(self.from_rows);
+        (self.from_rows + half < first || last_middle - half > last).then(|| {
             format!(
-                "from_rows = {} to to_rows = {} are beyond the reach of rows {first} to {last}, so the images are 0 everywhere: give rows within, or delays further from 0",
+                "from_rows = {} to to_rows = {} are not within the reach of rows {first} to {last}, so some images would be 0 everywhere: give rows within, or delays further from 0",
                 self.from_rows, self.to_rows
             )
         })
@@ -85,20 +86,21 @@ impl Bands {
         (self.from_rows..=self.to_rows).step_by(self.step_rows.unsigned_abs() as usize)
     }
 
-    /// The bands, by their middle rows. Bands of rows that no setting tells apart are replaced by all of these rows.
-    fn ranges(self, one_band: bool) -> Vec<(i32, RangeInclusive<i32>)> {
+    /// The bands. Those that divide rows which no setting tells apart are one, with all of these rows.
+    fn ranges(self, one_band: bool) -> Vec<RangeInclusive<i32>> {
         let half = self.width_rows / 2;
-        let cuts = |rows: &RangeInclusive<i32>| {
+        let divides = |rows: &RangeInclusive<i32>| {
             let inside = NEAR_ROWS.filter(|u| rows.contains(u)).count();
             one_band && inside > 0 && inside < NEAR_ROWS.count()
         };
-        let mut ranges = Vec::new();
-        for middle in self.middles() {
-            let rows = middle - half..=middle + half;
-            let band = if cuts(&rows) { (0, NEAR_ROWS) } else { (middle, rows) };
-            if ranges.last() != Some(&band) {
-                ranges.push(band);
-            }
+        let all = self.middles().map(|middle| middle - half..=middle + half);
+        let (divided, mut ranges): (Vec<_>, Vec<_>) = all.partition(divides);
+        if !divided.is_empty() {
+            let united = divided.iter().fold(NEAR_ROWS, |united, rows| {
+                *united.start().min(rows.start())..=*united.end().max(rows.end())
+            });
+            let before = ranges.iter().filter(|rows| rows.start() < united.start()).count();
+            ranges.insert(before, united);
         }
         ranges
     }
@@ -114,18 +116,23 @@ impl Bands {
         let ranges = self.ranges(one_band);
         let (_, rows, columns) = transport.t.dim();
         let mut images = Array3::zeros((ranges.len(), rows, columns));
-        for (mut image, (_, band)) in images.axis_iter_mut(Axis(0)).zip(&ranges) {
+        for (mut image, band) in images.axis_iter_mut(Axis(0)).zip(&ranges) {
             image.assign(&transport.band(band.clone()));
         }
         Product::Sequence {
             name,
             about: format!(
-                "light of bands of {} projector rows over their distance u from the pixel's own, which is the delay over {row_time_us:.4} µs a row; {}",
+                "light of bands of {} projector rows over their distance u from the pixel's own, which is the delay over {row_time_us:.3} µs a row{}; {}",
                 self.width_rows,
+                if one_band {
+                    ", of all bands that divide |u| <= 2 together, which nothing tells apart"
+                } else {
+                    ""
+                },
                 reach_of(transport)
             ),
             axis: "u, rows".into(),
-            at: ranges.iter().map(|(middle, _)| f64::from(*middle)).collect(),
+            at: ranges.iter().map(|band| f64::from(band.start() + band.end()) / 2.0).collect(),
             images,
             mask,
         }

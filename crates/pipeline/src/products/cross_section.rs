@@ -1,11 +1,11 @@
 //! Product `cross-section`: a row or a column of the regular, the captured epipolar and the sharpened epipolar image.
 
-use ndarray::{ArrayView2, Axis};
+use ndarray::{Array2, ArrayView2, Axis};
 use raysweep_transport::plane::Transport;
 use serde::Deserialize;
 
 use super::band::Width;
-use super::planned::Planned;
+use super::planned::{Planned, shown};
 use crate::product::{CrossSection, Product};
 use crate::schedule::{Schedule, SweepGeometry};
 use crate::stack::SweepStack;
@@ -76,11 +76,27 @@ impl SectionLine {
         transport: &Transport,
     ) -> Result<Option<Product>, String> {
         let Self { line, planned: Planned { exposure_us, .. }, delay_us } = self;
-        let captured = self.planned.image_at(stack, delay_us).ok_or_else(|| {
-            format!("no image at {delay_us} µs delay and {exposure_us} µs exposure is stored: resume the run")
-        })?;
-        let captured = stack.images.index_axis(Axis(0), captured);
-        let sharpened = transport.epipolar(Width::default().of(stack.one_band).rows());
+        let n = self.planned.image_at(stack, delay_us)?;
+        let own_rows = Width::default().of(stack.one_band);
+        // Of what saturates, only a bound is known.
+        let known = |image: ArrayView2<'_, f32>, is_known: Option<ArrayView2<'_, bool>>| {
+            let mut image = image.to_owned();
+            if let Some(is_known) = is_known {
+                image.zip_mut_with(&is_known, |light, is_known| {
+                    *light = if *is_known { *light } else { f32::NAN };
+                });
+            }
+            image
+        };
+        let valid = stack.valid.as_ref().map(|valid| valid.index_axis(Axis(0), n));
+        let captured = known(stack.images.index_axis(Axis(0), n), valid);
+        let is_told =
+            Array2::from_shape_fn(captured.dim(), |(t, s)| !transport.is_bound([t, s], own_rows.range()));
+        let sharpened = known(transport.epipolar(own_rows.rows()).view(), Some(is_told.view()));
+        let regular = stack
+            .regular
+            .as_ref()
+            .map(|image| known(image.view(), stack.regular_valid.as_ref().map(|valid| valid.view())));
         let cut = |image: ArrayView2<'_, f32>| -> Option<Vec<f64>> {
             let line = match line {
                 Line::Row(row) => {
@@ -92,8 +108,8 @@ impl SectionLine {
             Some(line.into_iter().map(f64::from).collect())
         };
         let curves = [
-            ("regular", stack.regular.as_ref().map(|image| image.view())),
-            ("captured", Some(captured)),
+            ("regular", regular.as_ref().map(|image| image.view())),
+            ("captured", Some(captured.view())),
             ("sharpened", Some(sharpened.view())),
         ];
         let curves = curves.into_iter().filter_map(|(curve, image)| Some((curve, cut(image?)?)));
@@ -103,8 +119,13 @@ impl SectionLine {
             Line::Column(column) => ("t", format!("column s = {column}")),
         };
         Ok((!curves.is_empty()).then(|| {
+            let own = match own_rows.rows() {
+                1 => "the pixel's own projector row".to_owned(),
+                rows => format!("{rows} projector rows about the pixel's own, which nothing tells apart"),
+            };
             let about = format!(
-                "{place} of the regular image, of that captured at a delay of {delay_us} µs and an exposure of {exposure_us} µs, and of the sharpened epipolar image, light from the pixel's own projector row"
+                "{place} of the regular image, of that captured at a delay of {} µs and an exposure of {exposure_us} µs, and of the sharpened epipolar image, light from {own}; NaN where a sample saturates",
+                shown(delay_us)
             );
             Product::CrossSection(CrossSection { name, about, along, curves })
         }))

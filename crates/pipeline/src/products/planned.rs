@@ -3,14 +3,15 @@
 use crate::schedule::{PointRole, Schedule};
 use crate::stack::SweepStack;
 
+/// Delays that differ by less are one, as printed.
+const SAME_US: f64 = 0.01;
+
 /// An exposure of the plan, and its delays.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Planned {
     pub exposure_us: f64,
     /// Number of delays at this exposure.
     pub delays: usize,
-    /// Half the smallest distance of two delays, by which measured delays are told apart.
-    within_us: f64,
 }
 
 impl Planned {
@@ -21,17 +22,13 @@ impl Planned {
         exposures_us.sort_by(f64::total_cmp);
         exposures_us.dedup();
         let exposure_us = exposure_us.or(exposures_us.first().copied()).unwrap_or_default();
-        let delays_us = delays_us(schedule, exposure_us);
-        if delays_us.is_empty() {
-            let what = format!("exposure_us = {exposure_us}: must be one of the plan's {exposures_us:?}");
-            return Err(("exposure_us", what));
+        match delays_us(schedule, exposure_us).len() {
+            0 => {
+                let what = format!("exposure_us = {exposure_us}: must be one of the plan's {exposures_us:?}");
+                Err(("exposure_us", what))
+            }
+            delays => Ok(Self { exposure_us, delays }),
         }
-        let gaps_us = delays_us.windows(2).map(|pair| pair[1] - pair[0]);
-        Ok(Self {
-            exposure_us,
-            delays: delays_us.len(),
-            within_us: gaps_us.fold(f64::INFINITY, f64::min) / 2.0,
-        })
     }
 
     /// The plan's delay at this exposure that is nearest to another.
@@ -41,43 +38,51 @@ impl Planned {
         delays_us.min_by(|a, b| off_us(a).total_cmp(&off_us(b))).unwrap_or(to_us)
     }
 
-    /// Refuses a delay that the plan does not have at this exposure.
-    pub(super) fn check_delay(
-        self,
-        schedule: &Schedule,
-        delay_us: f64,
-    ) -> Result<(), (&'static str, String)> {
-        let delays_us = delays_us(schedule, self.exposure_us);
-        if delays_us.contains(&delay_us) {
-            return Ok(());
+    /// The plan's delay at this exposure that is meant by another, which may be rounded.
+    pub(super) fn delay_us(self, schedule: &Schedule, delay_us: f64) -> Result<f64, (&'static str, String)> {
+        let nearest_us = self.nearest_delay_us(schedule, delay_us);
+        if (nearest_us - delay_us).abs() < SAME_US {
+            return Ok(nearest_us);
         }
+        let delays: Vec<String> = delays_us(schedule, self.exposure_us).into_iter().map(shown).collect();
         let what = format!(
-            "delay_us = {delay_us}: must be one of the plan's delays at {} µs exposure, {delays_us:?}",
-            self.exposure_us
+            "delay_us = {delay_us}: must be one of the plan's delays at {} µs exposure, {}",
+            self.exposure_us,
+            delays.join(", ")
         );
         Err(("delay_us", what))
     }
 
-    /// Indices of the images with this exposure, by delay.
+    /// Indices of the images with this exposure, by measured delay.
     pub(super) fn images_of(self, stack: &SweepStack) -> Vec<usize> {
         let mut taken: Vec<usize> =
             (0..stack.settings.len()).filter(|&n| stack.exposures_us[n] == self.exposure_us).collect();
-        taken.sort_by(|&a, &b| Self::delay_us(stack, a).total_cmp(&Self::delay_us(stack, b)));
+        let measured_us = |n: usize| stack.settings[n].mean_delay_us();
+        taken.sort_by(|&a, &b| measured_us(a).total_cmp(&measured_us(b)));
         taken
     }
 
-    /// Index of the image that was planned with this delay, if it is stored.
-    pub(super) fn image_at(self, stack: &SweepStack, delay_us: f64) -> Option<usize> {
-        let off_us = |n: &usize| (Self::delay_us(stack, *n) - delay_us).abs();
-        let images = self.images_of(stack).into_iter();
-        images.min_by(|a, b| off_us(a).total_cmp(&off_us(b))).filter(|n| off_us(n) < self.within_us)
+    /// Index of the image that was planned with this delay, if the transport is made from it.
+    ///
+    /// # Errors
+    /// Why it is not there.
+    pub(super) fn image_at(self, stack: &SweepStack, delay_us: f64) -> Result<usize, String> {
+        let found = self.images_of(stack).into_iter().find(|&n| stack.delays_us[n] == delay_us);
+        found.ok_or_else(|| {
+            format!(
+                "the image at {} µs delay and {} µs exposure is not stored, or was left out of the transport as the report says",
+                shown(delay_us),
+                self.exposure_us
+            )
+        })
     }
+}
 
-    /// The mean measured delay of an image.
-    pub(super) fn delay_us(stack: &SweepStack, n: usize) -> f64 {
-        let delays_us = &stack.settings[n].delays_us;
-        delays_us.iter().sum::<f64>() / delays_us.len() as f64
-    }
+/// A time as it is printed.
+pub(super) fn shown(us: f64) -> String {
+    let text = format!("{us:.2}");
+    let text = text.trim_end_matches('0').trim_end_matches('.');
+    if text == "-0" { "0".into() } else { text.into() }
 }
 
 /// The plan's delays at an exposure, sorted.

@@ -181,7 +181,8 @@ impl Relight {
                 });
             }
         };
-        Ok(Product::Image { name, about: format!("{says}; {reach}"), image: under(&weights)?, mask })
+        let about = format!("{says}; {reach}");
+        Ok(Product::Image { name, about, is_light: true, image: under(&weights)?, mask })
     }
 
     /// The pattern as text, and the brightness of each of the projector's rows; or the line of a sequence.

@@ -183,7 +183,7 @@ fn a_delay_profile_is_what_the_forward_model_says_of_its_pixels() {
 fn captured_images_are_those_of_the_stack_by_delay() {
     let make = |stack: &SweepStack, table: Value| spec(&table).unwrap().make(stack, &transport());
     let mut stack = stack();
-    // Taken in another order, and not quite at the planned delays.
+    // Taken so far from the planned delays that their order is another.
     for (n, delay_us) in [(0, 61.5), (2, -58.0)] {
         stack.settings[n].delays_us = vec![delay_us - 1.0, delay_us + 1.0];
     }
@@ -191,16 +191,15 @@ fn captured_images_are_those_of_the_stack_by_delay() {
     let Product::Sequence { name, at, images, .. } = film else { panic!() };
     assert_eq!((name.as_str(), at.as_slice()), ("captured_100us", [-58.0, 0.0, 61.5].as_slice()));
     assert_eq!(images, stack.images.select(Axis(0), &[2, 1, 0]));
-    let one = make(&stack, json!({ "kind": "captured", "delay_us": -60, "exposure_us": 100.0 })).unwrap();
-    let Product::Image { name, image, .. } = one else { panic!() };
-    assert_eq!(
-        (name.as_str(), image),
-        ("captured_-60us_100us", stack.images.index_axis(Axis(0), 2).to_owned())
-    );
+    let one = make(&stack, json!({ "kind": "captured", "delay_us": -60.004, "exposure_us": 100.0 })).unwrap();
+    let Product::Image { name, about, image, .. } = one else { panic!() };
+    let planned = stack.images.index_axis(Axis(0), 0).to_owned();
+    assert_eq!((name.as_str(), image), ("captured_-60us_100us", planned));
+    assert!(about.contains("delay of -60 µs (measured 61.5)"), "{about}");
     assert_eq!(spec(&json!({ "kind": "captured" })).unwrap().images(&geometry()), 3);
-    stack.keep(|n| n != 2);
+    stack.keep(|n| n != 0);
     let missing = make(&stack, json!({ "kind": "captured", "delay_us": -60 })).unwrap_err();
-    assert!(missing.what.contains("no image at -60 µs delay"), "{missing}");
+    assert!(missing.what.contains("the image at -60 µs delay"), "{missing}");
 }
 
 #[test]
@@ -233,7 +232,7 @@ fn bands_are_the_sums_of_their_rows() {
     }
     assert_eq!((bands.images(&geometry()), mask[[0, 0]]), (4, mask::MEASURED));
     let beyond = spec(&json!({ "kind": "bands", "from_rows": 6, "to_rows": 9 })).unwrap().beyond((-4, 4));
-    assert!(beyond.unwrap().contains("beyond the reach of rows -4 to 4"));
+    assert!(beyond.unwrap().contains("not within the reach of rows -4 to 4"));
     // Where no setting tells the rows next to the pixel's own apart, they are one band.
     let one_band = SweepStack { one_band: true, ..stack() };
     let single = spec(&json!({ "kind": "bands", "from_rows": -4, "to_rows": 3 })).unwrap();
@@ -242,6 +241,14 @@ fn bands_are_the_sums_of_their_rows() {
     };
     assert_eq!(at, [-4.0, -3.0, 0.0, 3.0]);
     assert_eq!(images.index_axis(Axis(0), 2), transport().t.slice(s![2..7, .., ..]).sum_axis(Axis(0)));
+    // No row is lost, though bands that divide these rows reach further.
+    let wide = json!({ "kind": "bands", "from_rows": -3, "to_rows": 3, "width_rows": 3, "step_rows": 3 });
+    let Product::Sequence { at, images, .. } = spec(&wide).unwrap().make(&one_band, &transport()).unwrap()
+    else {
+        panic!()
+    };
+    assert_eq!((at.as_slice(), images.len_of(Axis(0))), ([0.0].as_slice(), 1));
+    assert_eq!(images.index_axis(Axis(0), 0), transport().t.sum_axis(Axis(0)));
 }
 
 #[test]

@@ -65,7 +65,7 @@ impl LightOf {
         let about = format!(
             "standard deviation, through {of}, of {says}; without the prior's bias, which the product prior-bias bounds"
         );
-        Ok(Product::Image { name, about, image, mask })
+        Ok(Product::Image { name, about, is_light: false, image, mask })
     }
 
     /// The bound on the prior's bias for the same rows. `family` is that of the first strip.
@@ -87,7 +87,7 @@ impl LightOf {
             model.prior_bias_in_rows(first_row, transport, samples, sums, family)
         })?;
         let about = format!("bound on the bias that the prior gives to {says}, meant for 95 % of the pixels");
-        Ok(Product::Image { name, about, image, mask })
+        Ok(Product::Image { name, about, is_light: false, image, mask })
     }
 
     /// What the light is, and the image that `make` computes of it.

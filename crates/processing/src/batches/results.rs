@@ -100,7 +100,8 @@ pub fn make(
         }
         for (name, writer) in writers {
             writer.commit()?;
-            encoder.encode(session.products().dir(), &name, 1.0 / task.batches.path.duration_s())?;
+            let batches_per_s = 1.0 / task.batches.path.duration_s();
+            encoder.encode(session.products().dir(), &name, batches_per_s, go_on)?;
         }
         strips.extend(of_video);
     }

@@ -1,6 +1,6 @@
 //! The products of a film: one video each, with an image for each cycle that has a transport.
 
-use ndarray::Array2;
+use ndarray::{Array2, ArrayView3, Axis};
 use raysweep_pipeline::{FilmSolver, Product, ProductSpec, Stages, SweepStack, mask};
 use raysweep_session::film::{CycleEntry, CycleTransport, TransportFilm};
 use raysweep_session::ledger::State;
@@ -12,6 +12,7 @@ use serde_json::json;
 
 use super::frames::{NO_DARK, StoredCycle, StoredFrames};
 use super::task::FilmTask;
+use crate::plane::colour::{Values, axes, in_colour, mask_in_colour};
 use crate::plane::mask_bits;
 use crate::video::Encoder;
 
@@ -86,8 +87,11 @@ pub fn write_products(
                 return Ok(made);
             }
             match draft.spec.make(&stack, &transport) {
-                Ok(Product::Image { about, image, mask, .. }) => {
-                    draft.append(session, task, &cycles, number, (image, mask), about)?;
+                Ok(Product::Image { about, is_light, image, mask, .. }) => {
+                    let values = if is_light { Values::Light } else { Values::Errors };
+                    let image = in_colour(image.view(), task.task.mosaic, values);
+                    let mask = mask_in_colour(mask, task.task.mosaic);
+                    draft.append(session, task, &cycles, number, (image.view(), mask), about)?;
                     sound.push(draft);
                 }
                 Ok(_) => {
@@ -102,7 +106,7 @@ pub fn write_products(
     for Draft { spec, writer, about, pictures, .. } in drafts.into_iter().take_while(|_| go_on()) {
         if let Some(writer) = writer {
             writer.commit()?;
-            encoder.encode(session.products().dir(), spec.name(), images_per_s(&cycles))?;
+            encoder.encode(session.products().dir(), spec.name(), images_per_s(&cycles), go_on)?;
         }
         made.videos.push(FilmVideo { name: spec.name().to_owned(), about, pictures });
     }
@@ -197,16 +201,24 @@ impl<'a> Draft<'a> {
         task: &FilmTask,
         cycles: &[&CycleEntry],
         number: usize,
-        (image, mask): (Array2<f32>, Array2<u8>),
+        (image, mask): (ArrayView3<f32>, Array2<u8>),
         about: String,
     ) -> Result<()> {
-        let tone_map = *self.tone_map.get_or_insert_with(|| video_tone_map(&[image.view()]));
+        let tone_map = *self
+            .tone_map
+            .get_or_insert_with(|| video_tone_map(&image.axis_iter(Axis(2)).collect::<Vec<_>>()));
         if self.is_written {
             let writer = match &mut self.writer {
                 Some(writer) => writer,
-                None => self.writer.insert(begin(session, task, cycles, (self.spec.name(), &about), &image)?),
+                None => self.writer.insert(begin(
+                    session,
+                    task,
+                    cycles,
+                    (self.spec.name(), &about),
+                    image.dim().into(),
+                )?),
             };
-            writer.append_masked(image.view(), mask.view())?;
+            writer.append_masked(image, mask.view())?;
         }
         self.about = about;
         if number.is_multiple_of(cycles.len().div_ceil(SHOWN)) {
@@ -214,7 +226,7 @@ impl<'a> Draft<'a> {
             let caption = format!("cycle {} ({:.2} s)", entry.cycle, entry.start_s);
             let bounds = mask.mapv(|bits| bits & mask::BOUND_ONLY != 0);
             self.pictures
-                .push(Picture::grey(image.view(), tone_map).with_caption(caption).with_hatching(bounds));
+                .push(Picture::coloured(image, tone_map).with_caption(caption).with_hatching(bounds));
         }
         Ok(())
     }
@@ -226,17 +238,17 @@ fn begin(
     task: &FilmTask,
     cycles: &[&CycleEntry],
     (name, about): (&str, &str),
-    image: &Array2<f32>,
+    size: [usize; 3],
 ) -> Result<VideoWriter> {
     let mut metadata = task.task.metadata();
     let at: Vec<usize> = cycles.iter().map(|entry| entry.cycle).collect();
     let start_s: Vec<f64> = cycles.iter().map(|entry| entry.start_s).collect();
     metadata.insert("about".into(), json!(about));
-    metadata.insert("axes".into(), json!(["k", "t", "s"]));
+    metadata.insert("axes".into(), json!([&["k"], axes(task.task.mosaic)].concat()));
     metadata.insert("mask".into(), mask_bits());
     metadata.insert("k".into(), json!({ "is": "cycle", "at": at, "start_s": start_s }));
     metadata.insert("images_per_s".into(), json!(images_per_s(cycles)));
-    session.products().video(name, cycles.len(), [image.nrows(), image.ncols(), 1], &metadata)
+    session.products().video(name, cycles.len(), size, &metadata)
 }
 
 /// The pace of a video: that of the cycles, on average.

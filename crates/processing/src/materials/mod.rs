@@ -298,11 +298,7 @@ pub fn evaluate(
     Ok(evaluation)
 }
 
-/// Creates the folder of results.
-///
-/// # Errors
-/// If it exists.
-pub(crate) fn create_new(to: &Path) -> Result<(), ProcessError> {
+fn create_new(to: &Path) -> Result<(), ProcessError> {
     if to.exists() {
         return Err(ProcessError::Config(format!("{} already exists: give a new folder", to.display())));
     }

@@ -13,6 +13,7 @@ use raysweep_config::plan::{PatternPlan, PatternsPlan};
 use raysweep_core::Pattern;
 use raysweep_pipeline::mask;
 use raysweep_session::ledger::State;
+use raysweep_session::report::{Picture, ToneMap};
 use raysweep_session::{Result, Session, durable};
 use raysweep_transport::plane::separation::{CheckerboardSums, Separated, SeparatedSettings, separate};
 use serde_json::json;
@@ -20,9 +21,14 @@ use serde_json::json;
 pub(crate) use self::images::{LitImage, PictureImages};
 use self::task::{EPIPOLAR, REGULAR};
 pub use self::task::{PatternsTask, PictureSetting};
+use crate::plane::colour::{Values, axes, in_colour, mask_in_colour, sequence_in_colour};
 use crate::plane::manifest;
 use crate::stored::{Asked, ProcessError, Processed, Stored};
 
+/// Images of each product under pictures in the report.
+const SHOWN: usize = 8;
+/// White in pictures: this percentile of the pixels.
+const PERCENTILE: f64 = 99.5;
 /// Light of the projector's black as a share of its white, beyond which it is taken for an error.
 const MOST_BLACK: f64 = 0.5;
 
@@ -39,6 +45,8 @@ struct SeparatedSeries {
 /// What was made of a session.
 pub struct PatternProducts {
     series: Vec<SeparatedSeries>,
+    /// Some images under other pictures.
+    captured: Vec<Picture>,
     /// Light of the projector's black as a share of its white; `None`: not measured.
     black: Option<f64>,
     /// What could not be made, and why.
@@ -55,12 +63,14 @@ impl PatternProducts {
     pub fn make(session: &Session, state: &State, task: &PatternsTask) -> Result<Self> {
         let stack = session.stack()?;
         let images = PictureImages::new(task, state, &stack);
-        let (black, mut problems, mut all_series) = (black(&images), state.left_out(), Vec::new());
+        let (black, mut problems) = (black(&images), state.left_out());
+        let (mut all_series, mut captured) = (Vec::new(), Vec::new());
         let boards = task.series().iter().filter(|(_, plan, _)| is_checkerboard(plan)).count();
         for (name, plan, pictures) in task.series() {
             let PatternPlan::Checkerboard { size_px, .. } = *plan else {
-                if let Err(problem) = write_captured(session, &images, &name, pictures)? {
-                    problems.push(format!("{name}: {problem}"));
+                match write_captured(session, &images, &name, pictures)? {
+                    Ok(shown) => captured.extend(shown),
+                    Err(problem) => problems.push(format!("{name}: {problem}")),
                 }
                 continue;
             };
@@ -79,7 +89,7 @@ impl PatternProducts {
             }
         }
         let shortcomings = shortcomings(&all_series, black, boards);
-        Ok(Self { series: all_series, black, problems, shortcomings })
+        Ok(Self { series: all_series, captured, black, problems, shortcomings })
     }
 
     /// What could not be made, and what makes the products worse than they look.
@@ -208,17 +218,19 @@ fn write_separated(
     black: Option<f64>,
 ) -> Result<()> {
     let SeparatedSeries { suffix, separation, is_clipped, size_px } = series;
-    let bits = mask_bits(separation, is_clipped);
-    let write = |name: &str, about: &str, image: ArrayView2<f32>| {
+    let mosaic = task.task.mosaic;
+    let bits = mask_in_colour(mask_bits(separation, is_clipped), mosaic);
+    let write = |name: &str, about: &str, values: Values, image: ArrayView2<f32>| {
+        let image = in_colour(image, mosaic, values);
         let mut metadata = task.task.metadata();
-        metadata.insert("axes".into(), json!(["t", "s"]));
+        metadata.insert("axes".into(), json!(axes(mosaic)));
         metadata.insert("about".into(), json!(about));
         metadata.insert(
             "checkerboard".into(),
             json!({ "size_px": size_px, "blur_px_xy": separation.blur_px, "black": black }),
         );
         metadata.insert("mask".into(), json!({ "measured": mask::MEASURED, "bound only": mask::BOUND_ONLY }));
-        session.products().masked_image(name, image, bits.view(), &metadata)
+        session.products().masked_image(name, image.view(), bits.view(), &metadata)
     };
     for (setting, light) in task.settings().iter().zip(&separation.settings) {
         let prefix = prefix(setting);
@@ -232,29 +244,30 @@ fn write_separated(
         };
         let Separated { direct, direct_sd, global, global_sd } = light;
         for (kind, image, sd) in [("direct", direct, direct_sd), ("global", global, global_sd)] {
-            write(&format!("{prefix}{kind}{suffix}"), &format!("{kind} light of {of}"), image.view())?;
-            write(
-                &format!("{prefix}{kind}{suffix}-sd"),
-                &format!("standard deviation of the {kind} light of {of}"),
-                sd.view(),
-            )?;
+            let about = format!("{kind} light of {of}");
+            write(&format!("{prefix}{kind}{suffix}"), &about, Values::Light, image.view())?;
+            let about = format!("standard deviation of the {kind} light of {of}");
+            write(&format!("{prefix}{kind}{suffix}-sd"), &about, Values::Errors, sd.view())?;
         }
     }
     if let Some([image, sd]) = non_epipolar(task, separation) {
         write(
             &format!("non-epipolar{suffix}"),
             "light of all rows minus that of the epipolar image",
+            Values::Light,
             image.view(),
         )?;
         write(
             &format!("non-epipolar{suffix}-sd"),
             "standard deviation of the non-epipolar light",
+            Values::Errors,
             sd.view(),
         )?;
     }
     write(
         &format!("spread{suffix}"),
         "distance in projector pixels over which light spreads in the scene; 0: none is seen, NaN: too dark to tell",
+        Values::Errors,
         separation.spread_px.view(),
     )
 }
@@ -289,16 +302,17 @@ fn mask_bits(separation: &SeparatedSettings, is_clipped: &Array2<bool>) -> Array
     bits
 }
 
-/// Writes the images under the pictures of a series as they were taken, one product for each setting. The inner error
-/// says what keeps them from being used.
+/// Writes the images under the pictures of a series as they were taken, one product for each setting; returns pictures of
+/// some. The inner error says what keeps them from being used.
 fn write_captured(
     session: &Session,
     images: &PictureImages<'_>,
     name: &str,
     pictures: Range<usize>,
-) -> Result<std::result::Result<(), String>> {
+) -> Result<std::result::Result<Vec<Picture>, String>> {
     let task = images.task;
     let (height, width) = (task.task.geometry.height, task.task.geometry.width);
+    let mut drawn = Vec::new();
     for (index, setting) in task.settings().iter().enumerate() {
         let mut cube = Array3::zeros((pictures.len(), height, width));
         let mut bits = Array2::from_elem((height, width), mask::MEASURED);
@@ -314,8 +328,21 @@ fn write_captured(
                 });
             }
         }
-        let product = format!("{name}-{}", setting.name);
+        let (mosaic, product) = (task.task.mosaic, format!("{name}-{}", setting.name));
+        let bits = mask_in_colour(bits, mosaic);
         let shown: Vec<String> = pictures.clone().map(|picture| task.pictures[picture].to_string()).collect();
+        let images = sequence_in_colour(cube.view(), mosaic);
+        let planes: Vec<_> = images
+            .outer_iter()
+            .flat_map(|image| {
+                (0..image.len_of(Axis(2))).map(move |channel| image.index_axis_move(Axis(2), channel))
+            })
+            .collect();
+        let white = ToneMap::percentile(&planes, PERCENTILE);
+        for k in (0..shown.len()).step_by(shown.len().div_ceil(SHOWN)) {
+            let caption = format!("{product}: {}", shown[k]);
+            drawn.push(Picture::coloured(images.index_axis(Axis(0), k), white).with_caption(caption));
+        }
         let mut metadata = task.task.metadata();
         metadata.insert("mask".into(), json!({ "measured": mask::MEASURED, "bound only": mask::BOUND_ONLY }));
         let about = format!(
@@ -323,20 +350,20 @@ fn write_captured(
             setting.delay_us, setting.exposure_us
         );
         if let [only] = &shown[..] {
-            metadata.insert("axes".into(), json!(["t", "s"]));
+            metadata.insert("axes".into(), json!(axes(mosaic)));
             metadata.insert("about".into(), json!(format!("{about}, under {only}")));
-            let image = cube.index_axis(Axis(0), 0);
+            let image = images.index_axis(Axis(0), 0);
             session.products().masked_image(&product, image, bits.view(), &metadata)?;
         } else {
             let layers: Vec<String> = (0..shown.len()).map(|k| format!("k{k:04}")).collect();
-            metadata.insert("axes".into(), json!(["k", "t", "s"]));
+            metadata.insert("axes".into(), json!([&["k"], axes(mosaic)].concat()));
             metadata.insert("about".into(), json!(about));
             metadata.insert("k".into(), json!({ "is": "picture", "at": shown }));
             metadata.insert("layers".into(), json!(layers));
-            session.products().masked_sequence(&product, cube.view(), &layers, bits.view(), &metadata)?;
+            session.products().masked_sequence(&product, images.view(), &layers, bits.view(), &metadata)?;
         }
     }
-    Ok(Ok(()))
+    Ok(Ok(drawn))
 }
 
 /// Makes the products of stored images again.

@@ -1,6 +1,6 @@
 //! The report of a session with pictures.
 
-use ndarray::ArrayView2;
+use ndarray::{ArrayView2, Axis};
 use raysweep_session::Session;
 use raysweep_session::ledger::State;
 use raysweep_session::report::{Block, NoteLevel, Picture, Report, Section, Table, ToneMap};
@@ -8,7 +8,8 @@ use raysweep_session::stack::ArrayName;
 use raysweep_transport::plane::separation::Separated;
 
 use super::task::REGULAR;
-use super::{PatternProducts, PatternsTask, SeparatedSeries};
+use super::{PERCENTILE, PatternProducts, PatternsTask, SeparatedSeries};
+use crate::plane::colour::{Values, in_colour};
 use crate::plane::report::{jitter, settings};
 use crate::report::{accounts, named, page};
 
@@ -19,7 +20,7 @@ pub(super) fn make(
     task: &PatternsTask,
     products: &PatternProducts,
 ) -> Report {
-    let PatternProducts { series, black, problems, shortcomings } = products;
+    let PatternProducts { series, captured, black, problems, shortcomings } = products;
     let mut sections = Vec::new();
     let note = |level, texts: &[String]| {
         texts.iter().map(|text| Block::Note(level, text.clone())).collect::<Vec<_>>()
@@ -29,6 +30,10 @@ pub(super) fn make(
         sections.push(section("Problems", "", notes));
     }
     sections.extend(series.iter().map(|series| separation(task, series, *black)));
+    if !captured.is_empty() {
+        let intro = "Each product has its own scale. Of long series, some images are shown.";
+        sections.push(section("Images under pictures", intro, vec![Block::Pictures(captured.clone())]));
+    }
     sections.push(section("Settings", "", vec![settings(state, &task.task)]));
     let deviations: Vec<f64> = task
         .task
@@ -67,14 +72,15 @@ fn separation(task: &PatternsTask, series: &SeparatedSeries, black: Option<f64>)
     let SeparatedSeries { suffix, separation, size_px, .. } = series;
     let mut blocks = Vec::new();
     for (setting, Separated { direct, global, .. }) in task.settings().iter().zip(&separation.settings) {
-        let total = direct + global;
-        let scale = ToneMap::percentile(&[total.view()], 99.5);
+        let [total, direct, global] = [&(direct + global), direct, global]
+            .map(|image| in_colour(image.view(), task.task.mosaic, Values::Light).into_owned());
+        let scale = ToneMap::percentile(&total.axis_iter(Axis(2)).collect::<Vec<_>>(), PERCENTILE);
         let name = if setting.name == REGULAR { "" } else { &setting.name };
         let caption = |kind: &str| format!("{name} {kind}{suffix}").trim().to_owned();
         blocks.push(Block::Pictures(vec![
-            Picture::grey(total.view(), scale).with_caption(caption("total")),
-            Picture::grey(direct.view(), scale).with_caption(caption("direct")),
-            Picture::grey(global.view(), scale).with_caption(caption("global")),
+            Picture::coloured(total.view(), scale).with_caption(caption("total")),
+            Picture::coloured(direct.view(), scale).with_caption(caption("direct")),
+            Picture::coloured(global.view(), scale).with_caption(caption("global")),
         ]));
     }
     let row = |setting: &str, Separated { direct, direct_sd, global, global_sd }: &Separated| {

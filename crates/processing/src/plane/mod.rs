@@ -1,5 +1,6 @@
 //! Shared by the procedures of the plane rig: points, stages, and the model that turns counts into light.
 
+pub(crate) mod colour;
 pub mod manifest;
 mod processing;
 mod products;

@@ -54,7 +54,7 @@ pub(crate) fn settings(state: &State, task: &PlaneTask) -> Block {
     let mut entries = vec![
         ("stages", stages.collect::<Vec<_>>().join(", ")),
         ("row time", row_times(geometry)),
-        ("first row after VSYNC", format!("{:.3} µs", geometry.raster.first_row_us)),
+        ("first row after VSYNC", format!("{:.3} µs", geometry.first_row_us())),
         (
             "projector rows",
             format!(
@@ -78,10 +78,7 @@ pub(crate) fn settings(state: &State, task: &PlaneTask) -> Block {
 fn row_times(geometry: &SweepGeometry) -> String {
     let is_measured = geometry.row_table_us.is_some() || geometry.calibration.is_some();
     let table = if is_measured { ", by the measured table" } else { "" };
-    format!(
-        "projector {:.4} µs{table}, camera {:.4} µs",
-        geometry.raster.row_time_us, geometry.camera_row_time_us
-    )
+    format!("projector {:.4} µs{table}, camera {:.4} µs", geometry.row_time_us(), geometry.camera_row_time_us)
 }
 
 fn white(geometry: &SweepGeometry) -> String {

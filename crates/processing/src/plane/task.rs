@@ -5,10 +5,10 @@ use std::sync::Arc;
 use ndarray::Array2;
 use raysweep_config::rig::plane::{ScanKind, SpotKind};
 use raysweep_config::{ConfigError, Places, Plan, RigFile, StageTable};
-use raysweep_core::{PixelFormat, SettingsId, decoding_message};
+use raysweep_core::{Mosaic, PixelFormat, SettingsId, decoding_message};
 use raysweep_pipeline::{
-    DEMUX, DemuxFold, DemuxOptions, PlaneStage, Point, PointRole, Schedule, Spot, SpotScan, StageRefused,
-    Stages, SweepGeometry, Unit,
+    DEMUX, DemuxFold, DemuxOptions, HOT_PIXELS, PlaneStage, Point, PointRole, Schedule, Spot, SpotScan,
+    StageRefused, Stages, SweepGeometry, Unit,
 };
 use raysweep_session::ledger::{PointEntry, State};
 use raysweep_session::stack::ArrayName;
@@ -31,6 +31,8 @@ pub struct PlaneTask {
     pub schedule: Schedule,
     /// The model that turns counts into light transport.
     pub geometry: SweepGeometry,
+    /// What the camera's pixels see.
+    pub mosaic: Mosaic,
     /// When the calibration was made that the model uses, as its file says it; `None` without one.
     pub calibration_made: Option<String>,
     /// What is damaged and is left out of the results.
@@ -89,7 +91,19 @@ impl PlaneTask {
         let (name, stages, places) = (plan.name.clone(), plan.stages.clone(), plan.places.clone());
         let table = plan.procedure.kind();
         let left_out = Vec::new();
-        Self { name, stages, max_jitter_us, schedule, geometry, calibration_made, left_out, table, places }
+        let mosaic = rig.camera.pixel_format.mosaic;
+        Self {
+            name,
+            stages,
+            max_jitter_us,
+            schedule,
+            geometry,
+            mosaic,
+            calibration_made,
+            left_out,
+            table,
+            places,
+        }
     }
 
     /// The points of the sweep, or the settings of the film's cycle, with their ordinals.
@@ -219,7 +233,7 @@ impl PlaneTask {
             ("units", json!("1 = a white pixel lit by its own projector row")),
             ("plan", json!(self.name)),
             (DEMUX, json!(self.demux_table().map(|stage| &stage.options))),
-            ("row_time_us", json!(geometry.raster.row_time_us)),
+            ("row_time_us", json!(geometry.row_time_us())),
             ("first_row", json!(geometry.first_row)),
             ("row_pitch", json!(geometry.row_pitch)),
             ("camera_row_time_us", json!(geometry.camera_row_time_us)),
@@ -240,19 +254,29 @@ impl PlaneTask {
     }
 }
 
-/// Checks that no stage of a plan for a new run compares pixels that are two apart, unless the camera's pixels have a
-/// mosaic.
+/// Checks that the stages of a plan for a new run compare pixels of one colour: those that are two apart, if and only if
+/// the camera's pixels have a mosaic.
 ///
 /// # Errors
 /// With the position of the option in the plan.
 pub fn check_mosaic(plan: &Plan, format: PixelFormat) -> Result<(), ConfigError> {
-    let is_for_mosaics = |stage: &StageTable| stage.options.get("step_px").and_then(Value::as_u64) == Some(2);
-    match plan.stages.iter().position(is_for_mosaics).filter(|_| format.mosaic.red().is_none()) {
+    let step_px = |stage: &StageTable| match stage.options.get("step_px") {
+        None if stage.name == HOT_PIXELS => Some(1),
+        value => value.and_then(Value::as_u64),
+    };
+    let (wanted_px, why) = match format.mosaic.red() {
+        None => (1, "has no Bayer mosaic"),
+        Some(_) => (2, "has a Bayer mosaic, where neighbours see other colours"),
+    };
+    let wrong = plan.stages.iter().enumerate().find_map(|(index, stage)| {
+        let step_px = step_px(stage).filter(|step_px| [1, 2].contains(step_px) && *step_px != wanted_px)?;
+        Some((index, &stage.name, step_px))
+    });
+    match wrong {
         None => Ok(()),
-        Some(index) => {
+        Some((index, name, step_px)) => {
             let message = format!(
-                "stage {}: step_px = 2: must be 1, because camera.pixel_format = \"{format}\" has no Bayer mosaic",
-                plan.stages[index].name
+                "stage {name}: step_px = {step_px}: must be {wanted_px}, because camera.pixel_format = \"{format}\" {why}"
             );
             Err(plan.places.error(&["stage", &index.to_string(), "step_px"], message))
         }

@@ -67,7 +67,7 @@ pub fn process(stored: &Stored<'_>, sweep: SweepPlan, asked: &Asked) -> Result<P
     };
     results.write_transport()?;
     let overview = results.overview();
-    write_products(session, task, &mut results, &is_wanted)?;
+    write_products(session, task, &mut results, &is_wanted, &|| true)?;
     write_report(session, state, &sweep, &results, overview.as_ref())?;
     manifest::write(session, state, task, &rig)?;
     Ok(Processed {

@@ -9,6 +9,7 @@ use raysweep_transport::plane::Transport;
 use serde_json::{Map, Value, json};
 
 use super::strips::{Overview, StoredImages};
+use crate::plane::colour::{Values, axes, in_colour, mask_in_colour, sequence_in_colour};
 use crate::plane::{PlaneTask, Processing, mask_bits};
 use crate::video::Encoder;
 
@@ -182,7 +183,8 @@ impl TransportWriter {
 }
 
 /// Writes everything but the transport: images (EXR, NPY), sequences (EXR, NPY, PNG, MP4), tables (CSV, NPY). Of the
-/// products, only those with a wanted name are written; the report shows all of them.
+/// products, only those with a wanted name are written; the report shows all of them. Soon after `go_on` returns false,
+/// no more MP4 files are made.
 ///
 /// # Errors
 /// When the session cannot be written.
@@ -191,8 +193,9 @@ pub fn write_products(
     task: &PlaneTask,
     results: &mut Results,
     is_wanted: &dyn Fn(&str) -> bool,
+    go_on: &dyn Fn() -> bool,
 ) -> Result<()> {
-    let mut encoder = Encoder::default();
+    let (mut encoder, mosaic) = (Encoder::default(), task.mosaic);
     let files = session.products();
     let mut common = task.metadata();
     // As it was found, if the rig file does not state it.
@@ -200,23 +203,30 @@ pub fn write_products(
     common.extend(found.map(|sigma_rows| ("beam_sigma_rows".to_owned(), json!(sigma_rows))));
     for product in results.products.iter().filter(|product| is_wanted(product.name())) {
         match product {
-            Product::Image { name, about, image, mask } => {
+            Product::Image { name, about, is_light, image, mask } => {
+                let values = if *is_light { Values::Light } else { Values::Errors };
+                let (image, mask) =
+                    (in_colour(image.view(), mosaic, values), mask_in_colour(mask.clone(), mosaic));
                 let mut metadata = common.clone();
-                metadata.insert("axes".into(), json!(["t", "s"]));
+                metadata.insert("axes".into(), json!(axes(mosaic)));
                 metadata.insert("about".into(), json!(about));
                 metadata.insert("mask".into(), mask_bits());
                 files.masked_image(name, image.view(), mask.view(), &metadata)?;
+                files.remove_others(name, &[".exr", "_mask.npy"])?;
             }
             Product::Sequence { name, about, axis, at, images, mask } => {
                 let layers: Vec<String> = (0..at.len()).map(|k| format!("k{k:04}")).collect();
+                let (images, mask) =
+                    (sequence_in_colour(images.view(), mosaic), mask_in_colour(mask.clone(), mosaic));
                 let mut metadata = common.clone();
-                metadata.insert("axes".into(), json!(["k", "t", "s"]));
+                metadata.insert("axes".into(), json!([&["k"], axes(mosaic)].concat()));
                 metadata.insert("about".into(), json!(about));
                 metadata.insert("k".into(), json!({ "is": axis, "at": at }));
                 metadata.insert("layers".into(), json!(layers));
                 metadata.insert("mask".into(), mask_bits());
                 files.masked_sequence(name, images.view(), &layers, mask.view(), &metadata)?;
-                encoder.encode(files.dir(), name, IMAGES_PER_S)?;
+                files.remove_others(name, &[".exr", ".mp4", "_mask.npy", ""])?;
+                encoder.encode(files.dir(), name, IMAGES_PER_S, go_on)?;
             }
             Product::Profile(profile) => {
                 let mut metadata = common.clone();
@@ -244,7 +254,8 @@ fn write_table(
     metadata.insert("axes".into(), json!([along, "column"]));
     metadata.insert("about".into(), json!(about));
     metadata.insert("columns".into(), json!(columns.iter().map(|(name, _)| name).collect::<Vec<_>>()));
-    files.table(name, columns, &metadata)
+    files.table(name, columns, &metadata)?;
+    files.remove_others(name, &[".csv"])
 }
 
 /// The model and settings that the transport was estimated with.

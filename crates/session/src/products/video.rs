@@ -85,11 +85,11 @@ impl VideoWriter {
         self.append_with(image, None)
     }
 
-    /// Writes the next image `[t, s]` of a video that has masks, with its mask: its EXR file has the channel `mask`.
+    /// Writes the next image of a video that has masks, with its mask `[t, s]`: its EXR file has the channel `mask`.
     ///
     /// # Errors
     /// As [`Self::append`].
-    pub fn append_masked(&mut self, image: ArrayView2<f32>, mask: ArrayView2<u8>) -> Result<ToneMap> {
+    pub fn append_masked(&mut self, image: ArrayView3<f32>, mask: ArrayView2<u8>) -> Result<ToneMap> {
         let [images, rows, columns, _] = self.shape;
         if mask.dim() != (rows, columns) || self.next == images {
             let (what, found) = (format!("a mask of video `{}`", self.name), mask.shape().to_vec());
@@ -103,7 +103,7 @@ impl VideoWriter {
         let at = header_bytes + (self.next * bytes.len()) as u64;
         file.file().write_all_at(&bytes, at).map_err(file.failed())?;
         self.masks = Some((file, header_bytes));
-        self.append_with(image.insert_axis(Axis(2)), Some(mask.mapv(f32::from)))
+        self.append_with(image, Some(mask.mapv(f32::from)))
     }
 
     fn append_with(&mut self, image: ArrayView3<f32>, mask: Option<Array2<f32>>) -> Result<ToneMap> {

@@ -118,6 +118,11 @@ impl Picture {
         Picture::new(image, tone_map, PICTURE_MAX_PX)
     }
 
+    /// A grey or colour picture of a linear image `[t, s, channels]` with one or three channels.
+    pub fn coloured(image: ArrayView3<f32>, tone_map: ToneMap) -> Picture {
+        Picture::new(image, tone_map, PICTURE_MAX_PX)
+    }
+
     /// A grey or colour picture of a linear image `[t, s, channels]` with one or three channels, with all of its pixels.
     pub fn unreduced(image: ArrayView3<f32>, tone_map: ToneMap) -> Picture {
         Picture::new(image, tone_map, usize::MAX)
@@ -141,11 +146,9 @@ impl Picture {
         Array2::from_shape_fn(size, |place| mean_of_block(image, reduction, place))
     }
 
-    /// Images `[t, s]` of one size with one tone map, shown in a loop; `None` if there are none.
-    pub fn animation(images: &[ArrayView2<f32>], tone_map: ToneMap) -> Option<Picture> {
-        let frame = |image: &ArrayView2<f32>| {
-            Picture::new(image.view().insert_axis(Axis(2)), tone_map, ANIMATION_MAX_PX)
-        };
+    /// Images `[t, s, channels]` of one size with one tone map, shown in a loop; `None` if there are none.
+    pub fn animation(images: &[ArrayView3<f32>], tone_map: ToneMap) -> Option<Picture> {
+        let frame = |image: &ArrayView3<f32>| Picture::new(image.view(), tone_map, ANIMATION_MAX_PX);
         let (first, next) = images.split_first()?;
         Some(Picture { next: next.iter().map(frame).collect(), ..frame(first) })
     }

@@ -79,7 +79,7 @@ fn a_large_picture_is_reduced_by_averaging() {
 #[test]
 fn an_animation_holds_every_picture_in_order() {
     let images = [0.0, 1.0, 0.25].map(|light: f32| Array2::from_elem((2, 3), light));
-    let views: Vec<_> = images.iter().map(|image| image.view()).collect();
+    let views: Vec<_> = images.iter().map(|image| image.view().insert_axis(ndarray::Axis(2))).collect();
     let picture = Picture::animation(&views, ToneMap { white: 1.0 }).unwrap();
     let html = page(vec![Block::Pictures(vec![picture])]);
     let encoded = html.split("data:image/png;base64,").nth(1).unwrap().split('"').next().unwrap();

@@ -237,7 +237,7 @@ fn conclude(
         if let Some((live, overview)) = live.zip(overview.as_ref()) {
             show_last(live, overview, stored, computed);
         }
-        write_products(&session, task, results, &|_| true)?;
+        write_products(&session, task, results, &|_| true, &|| orders.go_on())?;
         ledger.append(&Entry::End(end.clone()))?;
         write_report(&session, ledger.state(), sweep, results, overview.as_ref())?;
         manifest::write(&session, ledger.state(), task, &rig.file)?;

@@ -64,7 +64,14 @@ pub fn view(rig: &DotRig, plan: &ViewfinderPlan, run: &Run, lit: &mut LitTime) -
     let full_dn = format.max_value();
     let scale =
         CountScale { black_dn: rig.file.camera.black_dn(), saturation_dn: saturation_dn(format), full_dn };
-    let seen = FinderRig { size, format, scale, exposure_us: settings.exposure_us, is_dot_rig: true };
+    let seen = FinderRig {
+        size,
+        format,
+        scale,
+        white_dn: None,
+        exposure_us: settings.exposure_us,
+        is_dot_rig: true,
+    };
     let mut finder = Finder::new(run, plan, &seen);
     let mut player = Player {
         orders,

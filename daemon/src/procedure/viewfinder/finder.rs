@@ -56,6 +56,8 @@ pub struct FinderRig {
     pub format: PixelFormat,
     /// The scale of their counts.
     pub scale: CountScale,
+    /// Counts above black of a white pixel under its own row.
+    pub white_dn: Option<f64>,
     /// Exposure of the first frames.
     pub exposure_us: f64,
     /// Whether there is a dot to be found.
@@ -65,7 +67,7 @@ pub struct FinderRig {
 impl Finder {
     /// A finder that has shown nothing yet.
     pub fn new(run: &Run, plan: &ViewfinderPlan, seen: &FinderRig) -> Self {
-        let &FinderRig { size: (rows, columns), format, scale, exposure_us, is_dot_rig } = seen;
+        let &FinderRig { size: (rows, columns), format, scale, white_dn, exposure_us, is_dot_rig } = seen;
         let now = Instant::now();
         Self {
             live: run.live.clone(),
@@ -85,6 +87,7 @@ impl Finder {
                 black_dn: scale.black_dn,
                 saturation_dn: scale.saturation_dn,
                 full_dn: scale.full_dn,
+                white_dn,
                 saturated: 0.0,
                 underexposed: 0.0,
                 mean_dn: 0.0,

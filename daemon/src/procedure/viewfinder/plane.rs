@@ -50,7 +50,14 @@ pub fn view(rig: &Rig, task: FinderTask, run: &Run, lit: &mut LitTime) -> Result
         full_dn: capabilities.format.max_value(),
     };
     let (size, format) = (found, capabilities.format);
-    let seen = FinderRig { size, format, scale, exposure_us: task.exposure_us(), is_dot_rig: false };
+    let seen = FinderRig {
+        size,
+        format,
+        scale,
+        white_dn: Some(geometry.white_dn),
+        exposure_us: task.exposure_us(),
+        is_dot_rig: false,
+    };
     let finder = Finder::new(run, &task.plan, &seen);
     let rows = AlignPictures::new(geometry.raster.rows, size);
     let buffer = FramePool::new(1, format.frame_bytes(size.0 * size.1)).take();

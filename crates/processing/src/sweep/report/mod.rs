@@ -60,9 +60,9 @@ fn make(
     if let Some(overview) = overview {
         let pixels: Vec<[usize; 2]> = markers.iter().map(|marker| [marker.row, marker.column]).collect();
         let over_rows = transport::read_profiles(&session.transport_path(), &pixels)?;
-        sections.extend(products::images(products, &markers));
+        sections.extend(products::images(products, task.task.mosaic, &markers));
         sections.push(profiles(&sweep, overview.u_min, &over_rows, &markers)?);
-        sections.extend(products::sequences(products));
+        sections.extend(products::sequences(products, task.task.mosaic));
         sections.extend(products::profiles(products));
         sections.extend(products::cross_sections(products));
     }

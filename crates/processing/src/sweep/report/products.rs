@@ -1,8 +1,11 @@
 //! The products that a plan names, as pictures and plots.
 
-use ndarray::{Array2, Array3, ArrayView2};
+use ndarray::{ArrayView3, ArrayView4, Axis};
+use raysweep_core::Mosaic;
 use raysweep_pipeline::{CrossSection, Product, Profile, mask};
 use raysweep_session::report::{Block, ContactSheet, Marker, Picture, Plot, Section, Series, ToneMap};
+
+use crate::plane::colour::{Values, in_colour, sequence_in_colour};
 
 /// Percentile of the pixels that maps to white in a picture.
 pub(super) const PERCENTILE: f64 = 99.5;
@@ -12,14 +15,22 @@ const SHEET_PICTURES: usize = 12;
 const ANIMATION_PICTURES: usize = 48;
 
 /// Section of the images, if there are any.
-pub(super) fn images(products: &[Product], markers: &[Marker]) -> Option<Section> {
+pub(super) fn images(products: &[Product], mosaic: Mosaic, markers: &[Marker]) -> Option<Section> {
     let pictures: Vec<Picture> = products
         .iter()
         .filter_map(|product| match product {
-            Product::Image { name, about, image, mask } => {
+            Product::Image { name, about, is_light, image, mask } => {
                 let bounds = mask.mapv(|bits| bits & mask::BOUND_ONLY != 0);
-                let shown = picture(image, &format!("{name}: {about}"));
-                Some(shown.with_markers(markers.to_vec()).with_hatching(bounds))
+                let values = if *is_light { Values::Light } else { Values::Errors };
+                let image = in_colour(image.view(), mosaic, values);
+                let tone_map = ToneMap::percentile(&image.axis_iter(Axis(2)).collect::<Vec<_>>(), PERCENTILE);
+                let shown = Picture::coloured(image.view(), tone_map);
+                Some(
+                    shown
+                        .with_caption(format!("{name}: {about}"))
+                        .with_markers(markers.to_vec())
+                        .with_hatching(bounds),
+                )
             }
             _ => None,
         })
@@ -31,39 +42,53 @@ pub(super) fn images(products: &[Product], markers: &[Marker]) -> Option<Section
     })
 }
 
-fn picture(image: &Array2<f32>, caption: &str) -> Picture {
-    Picture::grey(image.view(), ToneMap::percentile(&[image.view()], PERCENTILE)).with_caption(caption)
-}
-
 /// A section for each sequence: a contact sheet and an animation.
-pub(super) fn sequences(products: &[Product]) -> impl Iterator<Item = Section> {
-    products.iter().filter_map(|product| match product {
+pub(super) fn sequences(products: &[Product], mosaic: Mosaic) -> impl Iterator<Item = Section> {
+    products.iter().filter_map(move |product| match product {
         Product::Sequence { name, about, axis, at, images, .. } => {
-            Some(sequence(name, about, axis, at, images))
+            let images = sequence_in_colour(images.view(), mosaic);
+            Some(sequence(name, about, axis, at, images.view()))
         }
         _ => None,
     })
 }
 
-fn sequence(name: &str, about: &str, axis: &str, at: &[f64], images: &Array3<f32>) -> Section {
-    let views: Vec<ArrayView2<'_, f32>> = images.outer_iter().collect();
-    let tone_map = ToneMap::percentile(&views, PERCENTILE);
+fn sequence(name: &str, about: &str, axis: &str, at: &[f64], images: ArrayView4<'_, f32>) -> Section {
+    let views: Vec<ArrayView3<'_, f32>> = images.outer_iter().collect();
+    let planes: Vec<_> = views.iter().flat_map(|image| image.axis_iter(Axis(2))).collect();
+    let tone_map = ToneMap::percentile(&planes, PERCENTILE);
     let shown = spread(at.len(), SHEET_PICTURES);
     let sheet = ContactSheet {
         column_title: axis.into(),
-        columns: shown.iter().map(|&k| at[k].to_string()).collect(),
+        columns: shown.iter().map(|&k| value(at[k])).collect(),
         row_title: String::new(),
         rows: vec![name.into()],
-        pictures: shown.iter().map(|&k| Some(Picture::thumbnail(views[k], tone_map))).collect(),
+        pictures: shown.iter().map(|&k| Some(Picture::small(views[k], tone_map))).collect(),
     };
     let moving: Vec<_> = spread(views.len(), ANIMATION_PICTURES).into_iter().map(|k| views[k]).collect();
     let caption = format!("{} of {} images", moving.len(), views.len());
     let animation = Picture::animation(&moving, tone_map).map(|picture| picture.with_caption(caption));
+    let few = if shown.len() < at.len() {
+        format!(
+            " {} of {} images are shown; products/{name}/contact_sheet.png has all.",
+            shown.len(),
+            at.len()
+        )
+    } else {
+        String::new()
+    };
     Section {
         title: format!("Sequence {name}"),
-        intro: format!("{}.", capitalised(about)),
+        intro: format!("{}.{few}", capitalised(about)),
         blocks: vec![Block::ContactSheet(sheet), Block::Pictures(animation.into_iter().collect())],
     }
+}
+
+/// A value of an axis, without the digits that only computing gives.
+fn value(value: f64) -> String {
+    let text = format!("{value:.1}");
+    let text = text.strip_suffix(".0").unwrap_or(&text);
+    if text == "-0" { "0".into() } else { text.into() }
 }
 
 /// At most `most` of `len` indices, evenly spaced, including the first and the last.

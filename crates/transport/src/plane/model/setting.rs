@@ -14,6 +14,11 @@ impl Setting {
         Self { delays_us: vec![delay_us], exposure_us }
     }
 
+    /// The mean delay of its frames.
+    pub fn mean_delay_us(&self) -> f64 {
+        self.delays_us.iter().sum::<f64>() / self.delays_us.len() as f64
+    }
+
     /// The same setting with an exposure that begins at the same time and is longer by `by_us`.
     pub fn longer(&self, by_us: f64) -> Self {
         Self {

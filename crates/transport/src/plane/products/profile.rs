@@ -37,10 +37,8 @@ impl DelayProfile {
     /// The mean of `pixels` whose light was summed by [`Self::add_measured`] or [`Self::add_predicted`], one sum for
     /// each setting.
     pub fn mean(settings: &[Setting], sums: &[f64], pixels: usize) -> Self {
-        let mean_us =
-            |setting: &Setting| setting.delays_us.iter().sum::<f64>() / setting.delays_us.len() as f64;
         let light = sums.iter().map(|sum| sum / pixels as f64);
-        let mut points: Vec<(f64, f64)> = settings.iter().map(mean_us).zip(light).collect();
+        let mut points: Vec<(f64, f64)> = settings.iter().map(Setting::mean_delay_us).zip(light).collect();
         points.sort_by(|a, b| a.0.total_cmp(&b.0));
         let (delays_us, light) = points.into_iter().unzip();
         Self { delays_us, light }

@@ -138,7 +138,7 @@ function draw() {
   const rows = [];
   if (progress) {
     const lost = Object.entries(progress.counts.lost).map(([cause, frames]) => `${frames} ${words(cause)}`);
-    rows.push(["stored", `${progress.points_stored} of ${progress.points_planned}, with dark and regular images`]);
+    rows.push(["stored", `${progress.points_stored} of ${progress.points_planned}`]);
     if (isUnderWay && point) rows.push(["this point", `frame ${point.frames} of ${point.of}`]);
     if (isUnderWay) rows.push(["time left", clock(progress.left_s ?? NaN)]);
     rows.push(["elapsed", clock(progress.elapsed_s)], ["rate", `${number(progress.frames_per_s)} frames/s`],

@@ -140,8 +140,10 @@ const about = (session) => read(address(session));
 
 function rowsOf(session) {
   return [["kind", session.kind], ["begun", `${session.created.slice(0, 19).replace("T", " ")} UTC`],
-    ["state", session.state], ["stored", `${session.stored} of ${session.points} points`], ["operator", session.operator],
+    ["state", session.state], ["stored", `${session.stored} of ${session.points}`], ["operator", session.operator],
     ["sample", session.sample], ["note", session.note], ["tags", session.tags.join(", ")], ["error", session.error],
+    ...session.remarks.map(({ at, by, text }) =>
+      ["remark", `${at.slice(0, 16).replace("T", " ")} UTC${by ? `, ${by}` : ""}: ${text}`]),
     ...Object.entries(session.findings)];
 }
 
