@@ -28,6 +28,9 @@ const PICTURES: u64 = 8;
 const CONFIDENCE: f64 = 1.6;
 /// A scene that could be this much brighter is worth opening the aperture for.
 const WORTHWHILE: f64 = 1.1;
+/// With a larger expected error nothing is foreseen that frames are counted by, such as where the scenes that it is expected
+/// of saturate.
+const FORESEEN: f64 = 0.5;
 /// Most of a camera's full scale that a calibration takes of a white board.
 const MOST_OF_BOARD: f64 = 0.65;
 /// Edges nearer to the pixel's own row than this share of the exposure divide the light about it.
@@ -146,8 +149,9 @@ fn with_edges(delays: &Axis, exposure_us: f64, shorter_us: f64) -> Axis {
 /// The plan with as many frames per point that noise is as large as what averaging does not remove, and that number;
 /// `None` where nothing is averaged or foreseen.
 fn averaged(text: &str, foreseen: &CheckReport) -> Result<(String, Option<u32>), CommandFailure> {
+    let expected = foreseen.advice.as_ref().map(|advice| advice.expected);
     let Some(ExpectedError { noise, bias, calibration, .. }) =
-        foreseen.advice.as_ref().map(|advice| advice.expected)
+        expected.filter(|expected| expected.total.median < FORESEEN)
     else {
         return Ok((text.to_owned(), None));
     };

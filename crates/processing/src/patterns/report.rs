@@ -40,6 +40,8 @@ pub(super) fn make(
         .schedule
         .points
         .iter()
+        // A whole period has the same light at any delay.
+        .filter(|point| point.exposure_us < task.task.geometry.raster.period_us)
         .filter_map(|point| {
             let (array, index) = crate::plane::place(point.role);
             let entry = state.point(array, index).filter(|_| array == ArrayName::Sum)?;
