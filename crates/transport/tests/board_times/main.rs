@@ -213,7 +213,7 @@ fn camera_and_projector_of_different_row_times() {
 /// expected.
 #[test]
 fn a_camera_whose_row_time_is_not_known() {
-    for (seed, error) in [(31, 0.03), (35, -0.03), (33, 0.03)] {
+    for (seed, error) in [(31, 0.03), (35, -0.03)] {
         check(Case { camera_row_error: error, latency_us: 22.0, ..Case::window(seed) });
     }
     check(Case { camera_row_error: -0.03, ..Case::full(34) });
