@@ -102,7 +102,7 @@ fn sessions_that_do_not_fit_are_refused_by_name() {
         (&captured, &captured, &captured, "is no sweep"),
         (&sweep, &sweep, &sweep, "kind \"patterns\""),
         (&sweep, &gated, &gated, "patterns.regular = true"),
-        (&sweep, &smaller, &smaller, "has 24 projector rows"),
+        (&sweep, &smaller, &smaller, "shows 24 projector rows"),
     ] {
         let said = refusal(sweep, capture);
         assert!(said.contains(why) && said.contains(named.to_str().unwrap()), "{said}");

@@ -179,7 +179,8 @@ impl SweepGeometry {
 
     /// The mean time from one projector row to the next: as calibrated, or as the rig file has it.
     pub fn row_time_us(&self) -> f64 {
-        match self.calibration.as_deref().map(|calibration| &calibration.row_starts_us[..]) {
+        let calibrated = self.calibration.as_deref().map(|calibration| &calibration.row_starts_us[..]);
+        match calibrated.or(self.row_table_us.as_deref()) {
             Some([first, .., last]) => (last - first) / self.raster.rows as f64,
             _ => self.raster.row_time_us,
         }

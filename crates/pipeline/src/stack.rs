@@ -11,7 +11,7 @@ pub struct SweepStack {
     pub timing: RowTiming,
     /// The prior used for the transport.
     pub prior: Prior,
-    /// The planned delay of each image.
+    /// The planned delay of each image of a sweep; of a film, the measured one.
     pub delays_us: Vec<f64>,
     /// The planned exposure of each image.
     pub exposures_us: Vec<f64>,

@@ -22,7 +22,7 @@ impl MemoryNeed {
     /// When the plan gives no model on its rig.
     pub fn of_sweep(task: &PlaneTask, products: &[ProductSpec]) -> Result<Self, PlaneError> {
         let Solver { reach_rows, solver_bytes, pixels, .. } = Solver::of(task)?;
-        let geometry = &task.geometry;
+        let (geometry, channels) = (&task.geometry, task.mosaic.channels() as u64);
         let strip_px = (geometry.height.min(STRIP_ROWS) * geometry.width) as u64;
         // An upper bound for the rows of a strip and its halo.
         let chosen_by_px = (rows_to_choose_by(geometry.height).len() * geometry.width) as u64;
@@ -31,8 +31,11 @@ impl MemoryNeed {
         // The transport and its copy for the disk.
         let transport_bytes_per_px = 8 * reach_rows;
         let images = products.iter().map(|product| product.images(geometry) as u64);
-        // Each image once; the largest sequence twice more: as EXR channels and as the file's bytes.
-        let product_images = images.clone().sum::<u64>() + 2 * images.max().unwrap_or(0);
+        // Each image once; the largest sequence twice more: as EXR channels and as the file's bytes; in colour, it is three
+        // times as large, and its demosaiced copy comes to it.
+        let largest = images.clone().max().unwrap_or(0);
+        let copies = if channels > 1 { 3 * channels } else { 2 };
+        let product_images = images.sum::<u64>() + copies * largest;
         let product_bytes = 4 * pixels * product_images;
         // Sums of the transport for the report, and single images that are read and pass through the stages.
         let shown_bytes = 4 * pixels * (5 + 5);

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use ndarray::{Array1, Array2, Array3, ArrayView2, Axis, concatenate, s};
 use raysweep_config::Procedure;
+use raysweep_core::Mosaic;
 use raysweep_pipeline::{SweepGeometry, mask};
 use raysweep_session::integrity::damaged_files;
 use raysweep_session::products::Products;
@@ -16,7 +17,8 @@ use serde::Serialize;
 use serde_json::{Map, Value, json};
 
 use crate::patterns::{LitImage, PatternsTask, PictureImages};
-use crate::plane::mask_bits;
+use crate::plane::colour::{Values, axes, in_colour, mask_in_colour};
+use crate::plane::{PlaneTask, mask_bits};
 use crate::stored::{ProcessError, Stored};
 use crate::sweep::SweepTask;
 
@@ -63,6 +65,9 @@ pub struct RelitImage {
 /// The transport of a sweep, and the rows that it belongs to.
 struct Sweep {
     session: Session,
+    /// What the camera saw, see [`seen`].
+    seen: String,
+    mosaic: Mosaic,
     geometry: SweepGeometry,
     u_min: i32,
 }
@@ -101,7 +106,7 @@ pub fn relit(sweep: &Path, captures: &[PathBuf], to: &Path) -> Result<Vec<RelitP
             return Err(wrong(session, "is given twice"));
         }
         seen.push(real);
-        for capture in captured(session, &sweep.geometry)? {
+        for capture in captured(session, &sweep.seen)? {
             match groups.iter_mut().find(|group| group[0].weights == capture.weights) {
                 Some(group) => group.push(capture),
                 None => groups.push(vec![capture]),
@@ -120,7 +125,7 @@ pub fn relit(sweep: &Path, captures: &[PathBuf], to: &Path) -> Result<Vec<RelitP
     durable::replace_dir(to, |draft| {
         let mut pictures = Vec::new();
         for (k, (group, relit)) in groups.iter().zip(&images).enumerate() {
-            pictures.push(write(draft, &format!("picture_{k}"), sweep.session.dir(), group, relit)?);
+            pictures.push(write(draft, &format!("picture_{k}"), &sweep, group, relit)?);
         }
         let table = serde_json::to_vec_pretty(&pictures).map_err(|error| wrong(to, error))?;
         durable::write(&draft.join("relit.json"), &table)?;
@@ -132,11 +137,12 @@ pub fn relit(sweep: &Path, captures: &[PathBuf], to: &Path) -> Result<Vec<RelitP
 fn write(
     folder: &Path,
     name: &str,
-    sweep: &Path,
+    sweep: &Sweep,
     group: &[Capture],
     Relit { image, mask }: &Relit,
 ) -> Result<RelitPicture, ProcessError> {
     let (reference, others) = (&group[0], &group[1..]);
+    let (dir, mosaic) = (sweep.session.dir(), sweep.mosaic);
     let is_known = |place: [usize; 2]| {
         mask[place] & mask::MEASURED != 0 && !group.iter().any(|capture| capture.is_clipped[place])
     };
@@ -144,23 +150,24 @@ fn write(
         let (snr_db, psnr_db) = ratios_db(reference.light.view(), image.view(), is_known);
         RelitImage { session: session.to_owned(), relit: light_s.is_none(), light_s, snr_db, psnr_db }
     };
-    let images = std::iter::once(compared(sweep, None, image))
+    let images = std::iter::once(compared(dir, None, image))
         .chain(others.iter().map(|other| compared(&other.session, Some(other.light_s), &other.light)))
         .collect();
     let metadata = Map::from_iter([
-        ("axes".to_owned(), json!(["t", "s"])),
+        ("axes".to_owned(), json!(axes(mosaic))),
         ("units".to_owned(), json!("1 is a white pixel under its own row")),
         ("about".to_owned(), json!(format!("relit by the transport under {}", reference.shows))),
         ("mask".to_owned(), mask_bits()),
-        ("session".to_owned(), json!(sweep)),
+        ("session".to_owned(), json!(dir)),
     ]);
-    let channels = image.view().insert_axis(Axis(2));
-    Products::new(folder).masked_image(name, channels, mask.view(), &metadata)?;
+    let (colours, bits) =
+        (in_colour(image.view(), mosaic, Values::Light), mask_in_colour(mask.clone(), mosaic));
+    Products::new(folder).masked_image(name, colours.view(), bits.view(), &metadata)?;
     // As in the table, and the reference last.
-    let shown: Vec<ArrayView2<f32>> = std::iter::once(image)
+    let shown: Vec<Array3<f32>> = std::iter::once(image)
         .chain(others.iter().map(|other| &other.light))
         .chain([&reference.light])
-        .map(|image| image.view())
+        .map(|image| in_colour(image.view(), mosaic, Values::Light).into_owned())
         .collect();
     let white = ToneMap::percentile(&[reference.light.view()], PERCENTILE);
     durable::write(&folder.join(format!("{name}.png")), &side_by_side(&shown, white)?)?;
@@ -207,7 +214,7 @@ fn with_stored<T>(
 
 impl Sweep {
     fn open(dir: &Path) -> Result<Self, ProcessError> {
-        let mut geometry = with_stored(dir, |stored| {
+        let (mut geometry, seen, mosaic) = with_stored(dir, |stored| {
             let Procedure::Sweep(own) = stored.plan.procedure.clone() else {
                 return Err(wrong(
                     dir,
@@ -216,7 +223,7 @@ impl Sweep {
             };
             let rig = stored.plane_rig()?;
             let task = SweepTask::new(stored.plan, own, &stored.known(&rig)?);
-            Ok(task.task.geometry.clone())
+            Ok((task.task.geometry.clone(), seen(stored, &task.task), task.task.mosaic))
         })?;
         let session = Session::open(dir)?;
         let path = session.transport_path();
@@ -242,7 +249,7 @@ impl Sweep {
         // As the sweep found it, if the rig file does not state it.
         let found_rows = attributes.get("beam_sigma_rows").and_then(Value::as_f64);
         geometry.beam_sigma_rows = found_rows.or(geometry.beam_sigma_rows);
-        Ok(Self { session, geometry, u_min })
+        Ok(Self { session, seen, mosaic, geometry, u_min })
     }
 
     /// The scene under these weights of the projector's rows.
@@ -264,12 +271,15 @@ impl Sweep {
             let RelitUnknowns { is_bound, is_beyond } =
                 RelitUnknowns::of(&timing, first, &transport, weights.view(), RelitBeam::AsLit)
                     .map_err(refused)?;
-            for (place, bits) in mask.slice_mut(s![first..end, ..]).indexed_iter_mut() {
-                if is_bound[place] {
-                    *bits = mask::BOUND_ONLY;
+            for (place, of_pixel) in mask.slice_mut(s![first..end, ..]).indexed_iter_mut() {
+                let stored = bits.slice(s![.., place.0, place.1]);
+                if stored.iter().all(|bits| bits & (mask::MEASURED | mask::BOUND_ONLY) == 0) {
+                    *of_pixel = 0;
+                } else if is_bound[place] {
+                    *of_pixel = mask::BOUND_ONLY;
                 }
                 if is_beyond[place] {
-                    *bits |= mask::OUTSIDE_REACH;
+                    *of_pixel |= mask::OUTSIDE_REACH;
                 }
             }
         }
@@ -277,8 +287,18 @@ impl Sweep {
     }
 }
 
+/// What the camera saw of the projector, and in which units: the same in images that can be compared.
+fn seen(stored: &Stored<'_>, task: &PlaneTask) -> String {
+    let SweepGeometry { raster, height, width, row_pitch, .. } = &task.geometry;
+    let made = task.calibration_made.as_deref().unwrap_or("none");
+    format!(
+        "{} projector rows of {} µs, of which {height} rows and {width} columns of a camera ({:?}) see row {} on, {row_pitch} apart; calibration: {made}",
+        raster.rows, raster.row_time_us, task.mosaic, stored.state.session.first_row
+    )
+}
+
 /// The regular images of a session that were taken under pictures of rows.
-fn captured(dir: &Path, sweep: &SweepGeometry) -> Result<Vec<Capture>, ProcessError> {
+fn captured(dir: &Path, of_sweep: &str) -> Result<Vec<Capture>, ProcessError> {
     with_stored(dir, |stored| {
         let Procedure::Patterns(own) = stored.plan.procedure.clone() else {
             return Err(wrong(dir, "has no captures under pictures: give sessions of kind \"patterns\""));
@@ -290,16 +310,11 @@ fn captured(dir: &Path, sweep: &SweepGeometry) -> Result<Vec<Capture>, ProcessEr
         let task = PatternsTask::new(stored.plan, own, &stored.known(&rig)?)
             .map_err(|error| stored.in_plan(&error))?;
         let geometry = &task.task.geometry;
-        let seen = |geometry: &SweepGeometry| {
-            let SweepGeometry { raster, height, width, first_row, row_pitch, .. } = geometry;
-            format!(
-                "{} projector rows of {} µs, of which {height} rows and {width} columns of the camera see row {first_row} on, {row_pitch} apart",
-                raster.rows, raster.row_time_us
-            )
-        };
-        if seen(geometry) != seen(sweep) {
-            let (own, others) = (seen(geometry), seen(sweep));
-            let what = format!("has {own}, the sweep {others}: take both with the same rig and region");
+        let own = seen(stored, &task.task);
+        if own != of_sweep {
+            let what = format!(
+                "shows {own}, the sweep {of_sweep}: take both with the same rig, region and calibration"
+            );
             return Err(wrong(dir, what));
         }
         let (rows, stack) = (geometry.raster.rows, stored.session.stack()?);
@@ -353,17 +368,17 @@ fn ratios_db(
     (db(signal / error), db(peak * peak * pixels / error))
 }
 
-/// A PNG file of images of one size.
-fn side_by_side(images: &[ArrayView2<f32>], white: ToneMap) -> Result<Vec<u8>, ProcessError> {
-    let rows = images.first().map_or(0, |image| image.nrows());
-    let gap = Array2::<f32>::zeros((rows, GAP_PX));
+/// A PNG file of images `[t, s, channels]` of one size.
+fn side_by_side(images: &[Array3<f32>], white: ToneMap) -> Result<Vec<u8>, ProcessError> {
+    let (rows, _, channels) = images.first().map_or((0, 0, 1), Array3::dim);
+    let gap = Array3::<f32>::zeros((rows, GAP_PX, channels));
     let mut parts = Vec::new();
     for image in images {
         parts.extend([image.view(), gap.view()]);
     }
     parts.pop();
     let all = concatenate(Axis(1), &parts).map_err(|error| ProcessError::Config(error.to_string()))?;
-    Ok(Picture::unreduced(all.view().insert_axis(Axis(2)), white).to_png()?)
+    Ok(Picture::unreduced(all.view(), white).to_png()?)
 }
 
 #[cfg(test)]

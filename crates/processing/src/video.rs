@@ -1,15 +1,18 @@
 //! Video files from the pictures of products.
 
 use std::ffi::OsStr;
-use std::io::ErrorKind;
+use std::io::{ErrorKind, Read};
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use raysweep_session::{Result, durable};
 
-/// Longer than any video takes.
-const LIMIT: Duration = Duration::from_secs(1800);
+/// Longer than a video takes, and each of its images.
+const LIMIT: Duration = Duration::from_secs(300);
+const LIMIT_OF_IMAGE: Duration = Duration::from_secs(1);
+/// Most of its messages that are told.
+const MOST_SAID_BYTES: u64 = 1 << 16;
 /// How often it is looked whether ffmpeg has ended.
 const LOOK: Duration = Duration::from_millis(20);
 
@@ -92,24 +95,35 @@ fn encode_by(
         }
         Err(error) => return Err(failed(error.to_string())),
     };
+    // Read all the while: a full pipe would hold it up.
+    let said = ffmpeg.stderr.take().map(|stderr| {
+        std::thread::spawn(move || {
+            let mut said = Vec::new();
+            let mut stderr = stderr.take(MOST_SAID_BYTES);
+            let _ = stderr.read_to_end(&mut said);
+            let _ = std::io::copy(&mut stderr.into_inner(), &mut std::io::sink());
+            String::from_utf8_lossy(&said).trim().to_owned()
+        })
+    });
+    let files = std::fs::read_dir(images).map_or(0, Iterator::count);
+    let limit = LIMIT + LIMIT_OF_IMAGE * u32::try_from(files).unwrap_or(u32::MAX);
     let began = Instant::now();
-    loop {
+    let ended = loop {
         match ffmpeg.try_wait() {
-            Ok(None) if go_on() && began.elapsed() < LIMIT => std::thread::sleep(LOOK),
-            Ok(Some(_)) => break,
-            Ok(None) | Err(_) => {
-                // Nothing is left of it if it has ended meanwhile.
-                let _ = ffmpeg.kill();
-                let _ = ffmpeg.wait();
-                let why = if go_on() { format!("it took more than {LIMIT:?}") } else { "broken off".into() };
-                return Err(failed(why));
-            }
+            Ok(None) if !go_on() => break Err("broken off".to_owned()),
+            Ok(None) if began.elapsed() > limit => break Err(format!("it took more than {limit:?}")),
+            Ok(None) => std::thread::sleep(LOOK),
+            Ok(Some(status)) => break Ok(status),
+            Err(error) => break Err(error.to_string()),
         }
-    }
-    match ffmpeg.wait_with_output() {
-        Ok(output) if output.status.success() => Ok(()),
-        Ok(output) => Err(failed(String::from_utf8_lossy(&output.stderr).trim().to_owned())),
-        Err(error) => Err(failed(error.to_string())),
+    };
+    // Nothing is left of it if it has ended.
+    let _ = ffmpeg.kill();
+    let _ = ffmpeg.wait();
+    match ended {
+        Ok(status) if status.success() => Ok(()),
+        Ok(_) => Err(failed(said.and_then(|said| said.join().ok()).unwrap_or_default())),
+        Err(why) => Err(failed(why)),
     }
 }
 

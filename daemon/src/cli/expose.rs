@@ -189,7 +189,7 @@ struct Tried {
     saturated: f64,
     /// Whether the share is at most [`MAX_SATURATED`], beyond doubt as far as so many pixels can tell.
     suits: bool,
-    /// By how much the scene could be brighter until too many pixels saturate.
+    /// By how much the light could grow until too many pixels saturate, or a white board has more than a calibration takes.
     headroom: f64,
 }
 

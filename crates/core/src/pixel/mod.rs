@@ -31,6 +31,11 @@ impl Mosaic {
     /// All mosaics.
     pub const ALL: [Self; 5] = [Self::Mono, Self::BayerGR, Self::BayerRG, Self::BayerGB, Self::BayerBG];
 
+    /// Number of colours of its demosaiced images.
+    pub fn channels(self) -> usize {
+        if self.red().is_some() { 3 } else { 1 }
+    }
+
     /// Column and row (0 or 1) of the red pixel in the mosaic's 2 x 2 cell; `None` for [`Mosaic::Mono`].
     pub fn red(self) -> Option<(usize, usize)> {
         match self {

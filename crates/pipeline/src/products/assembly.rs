@@ -88,7 +88,8 @@ impl Assembly {
             ProductKind::Band(band) => band.of(stack.one_band).make(name, transport, mask),
             ProductKind::Bands(bands) => {
                 let timing = &stack.timing;
-                let lit_us = timing.row_starts_us().last().copied().unwrap_or_default();
+                let starts_us = timing.row_starts_us();
+                let lit_us = starts_us[timing.projector_rows()] - starts_us[0];
                 let row_time_us = lit_us / timing.projector_rows() as f64;
                 bands.make(name, row_time_us, stack.one_band, transport, mask)
             }

@@ -1,6 +1,6 @@
 //! Product `cross-section`: a row or a column of the regular, the captured epipolar and the sharpened epipolar image.
 
-use ndarray::{Array2, ArrayView2, Axis};
+use ndarray::{Array2, Array3, ArrayView2, Axis, s};
 use raysweep_transport::plane::Transport;
 use serde::Deserialize;
 
@@ -90,8 +90,10 @@ impl SectionLine {
         };
         let valid = stack.valid.as_ref().map(|valid| valid.index_axis(Axis(0), n));
         let captured = known(stack.images.index_axis(Axis(0), n), valid);
-        let is_told =
-            Array2::from_shape_fn(captured.dim(), |(t, s)| !transport.is_bound([t, s], own_rows.range()));
+        let is_told = Array2::from_shape_fn(captured.dim(), |(t, s)| {
+            let is_measured = |valid: &Array3<bool>| valid.slice(s![.., t, s]).iter().any(|valid| *valid);
+            stack.valid.as_ref().is_none_or(is_measured) && !transport.is_bound([t, s], own_rows.range())
+        });
         let sharpened = known(transport.epipolar(own_rows.rows()).view(), Some(is_told.view()));
         let regular = stack
             .regular
@@ -124,7 +126,7 @@ impl SectionLine {
                 rows => format!("{rows} projector rows about the pixel's own, which nothing tells apart"),
             };
             let about = format!(
-                "{place} of the regular image, of that captured at a delay of {} µs and an exposure of {exposure_us} µs, and of the sharpened epipolar image, light from {own}; NaN where a sample saturates",
+                "{place} of the regular image, of that captured at a delay of {} µs and an exposure of {exposure_us} µs, and of the sharpened epipolar image, light from {own}; NaN where a sample saturates or is not measured",
                 shown(delay_us)
             );
             Product::CrossSection(CrossSection { name, about, along, curves })

@@ -10,7 +10,7 @@ use std::sync::Arc;
 use ndarray::{Array2, Array3, ArrayView2, Axis};
 use raysweep_config::RigFile;
 use raysweep_config::plan::{PatternPlan, PatternsPlan};
-use raysweep_core::Pattern;
+use raysweep_core::{Mosaic, Pattern};
 use raysweep_pipeline::mask;
 use raysweep_session::ledger::State;
 use raysweep_session::report::{Picture, ToneMap};
@@ -219,9 +219,12 @@ fn write_separated(
 ) -> Result<()> {
     let SeparatedSeries { suffix, separation, is_clipped, size_px } = series;
     let mosaic = task.task.mosaic;
-    let bits = mask_in_colour(mask_bits(separation, is_clipped), mosaic);
-    let write = |name: &str, about: &str, values: Values, image: ArrayView2<f32>| {
-        let image = in_colour(image, mosaic, values);
+    let bits = mask_bits(separation, is_clipped);
+    // What is neither light nor its error has no colour.
+    let write = |name: &str, about: &str, values: Option<Values>, image: ArrayView2<f32>| {
+        let mosaic = if values.is_some() { mosaic } else { Mosaic::Mono };
+        let image = in_colour(image, mosaic, values.unwrap_or(Values::Errors));
+        let bits = mask_in_colour(bits.clone(), mosaic);
         let mut metadata = task.task.metadata();
         metadata.insert("axes".into(), json!(axes(mosaic)));
         metadata.insert("about".into(), json!(about));
@@ -245,29 +248,29 @@ fn write_separated(
         let Separated { direct, direct_sd, global, global_sd } = light;
         for (kind, image, sd) in [("direct", direct, direct_sd), ("global", global, global_sd)] {
             let about = format!("{kind} light of {of}");
-            write(&format!("{prefix}{kind}{suffix}"), &about, Values::Light, image.view())?;
+            write(&format!("{prefix}{kind}{suffix}"), &about, Some(Values::Light), image.view())?;
             let about = format!("standard deviation of the {kind} light of {of}");
-            write(&format!("{prefix}{kind}{suffix}-sd"), &about, Values::Errors, sd.view())?;
+            write(&format!("{prefix}{kind}{suffix}-sd"), &about, Some(Values::Errors), sd.view())?;
         }
     }
     if let Some([image, sd]) = non_epipolar(task, separation) {
         write(
             &format!("non-epipolar{suffix}"),
             "light of all rows minus that of the epipolar image",
-            Values::Light,
+            Some(Values::Light),
             image.view(),
         )?;
         write(
             &format!("non-epipolar{suffix}-sd"),
             "standard deviation of the non-epipolar light",
-            Values::Errors,
+            Some(Values::Errors),
             sd.view(),
         )?;
     }
     write(
         &format!("spread{suffix}"),
         "distance in projector pixels over which light spreads in the scene; 0: none is seen, NaN: too dark to tell",
-        Values::Errors,
+        None,
         separation.spread_px.view(),
     )
 }

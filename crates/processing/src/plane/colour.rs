@@ -7,13 +7,13 @@ use ndarray::{Array2, Array3, Array4, ArrayView2, ArrayView3, Axis, CowArray, Ix
 use raysweep_core::Mosaic;
 use raysweep_pipeline::mask;
 
-/// Pixels by which an image is continued beyond its edges, by reflection, which keeps the mosaic: as far as colours are
-/// interpolated from.
-const MARGIN_PX: usize = 4;
+/// Pixels by which an image is continued beyond its edges, by reflection: as far as colours are interpolated from, and
+/// even, which keeps the mosaic.
+const MARGIN_PX: usize = 6;
 /// Pixels around one over which the differences of its colours are evened out.
 const MEDIAN_PX: usize = 2;
 /// Pixels beside a saturated one whose colours are interpolated from it.
-const REACH_PX: usize = 2 + MEDIAN_PX;
+const REACH_PX: usize = 3 + MEDIAN_PX;
 const GREEN: usize = 1;
 
 /// What the values of an image are.
@@ -53,8 +53,8 @@ pub(crate) fn sequence_in_colour(images: ArrayView3<'_, f32>, mosaic: Mosaic) ->
     CowArray::from(all)
 }
 
-/// The mask of an image in colour: where a colour is interpolated from a pixel of which only a bound is known, no more is
-/// known of it.
+/// The mask of an image in colour: where a colour is interpolated from a pixel of which only a bound or nothing is known, no
+/// more is known of it.
 pub(crate) fn mask_in_colour(bits: Array2<u8>, mosaic: Mosaic) -> Array2<u8> {
     if mosaic.red().is_none() {
         return bits;
@@ -63,9 +63,15 @@ pub(crate) fn mask_in_colour(bits: Array2<u8>, mosaic: Mosaic) -> Array2<u8> {
     Array2::from_shape_fn((rows, columns), |(t, s)| {
         let near = |at: usize, end: usize| at.saturating_sub(REACH_PX)..(at + REACH_PX + 1).min(end);
         let around = bits.slice(s![near(t, rows), near(s, columns)]);
-        match around.iter().any(|bits| bits & mask::BOUND_ONLY != 0) {
-            true => bits[[t, s]] & !mask::MEASURED | mask::BOUND_ONLY,
-            false => bits[[t, s]],
+        let is_known = |bits: u8| bits & (mask::MEASURED | mask::BOUND_ONLY) != 0;
+        let own = bits[[t, s]];
+        match () {
+            () if !is_known(own) => own,
+            () if around.iter().any(|bits| bits & mask::BOUND_ONLY != 0) => {
+                own & !mask::MEASURED | mask::BOUND_ONLY
+            }
+            () if !around.iter().all(|bits| is_known(*bits)) => own & !mask::MEASURED,
+            () => own,
         }
     })
 }
@@ -80,7 +86,7 @@ fn pattern(mosaic: Mosaic) -> Option<CfaPattern> {
     }
 }
 
-/// Red, green and blue `[t, s, 3]`. Samples keep their values; the other colours follow along edges.
+/// Red, green and blue `[t, s, 3]`. Samples keep their values; the other colours of light follow along edges.
 fn demosaiced(image: ArrayView2<'_, f32>, pattern: &CfaPattern, values: Values) -> Array3<f32> {
     let algorithm = match values {
         Values::Light => Algorithm::Ppg,
@@ -100,8 +106,11 @@ fn demosaiced(image: ArrayView2<'_, f32>, pattern: &CfaPattern, values: Values) 
         // Refused are only lengths that contradict the size.
         let _ = demosaic(input, size.1, size.0, pattern, algorithm, output);
     }
-    if values == Values::Light {
-        planes = without_fringes(padded.view(), planes.view(), pattern);
+    match values {
+        Values::Light => planes = without_fringes(padded.view(), planes.view(), pattern),
+        Values::Errors => padded
+            .indexed_iter()
+            .for_each(|((t, s), sample)| planes[[pattern.color_at(t, s) as usize, t, s]] = *sample),
     }
     let within = s![.., MARGIN_PX..MARGIN_PX + rows, MARGIN_PX..MARGIN_PX + columns];
     planes.slice(within).permuted_axes([1, 2, 0]).as_standard_layout().into_owned()
@@ -200,11 +209,53 @@ mod tests {
     }
 
     #[test]
+    fn a_sample_changes_no_colour_beyond_the_reach_that_masks_have() {
+        let texture = |t: usize, s: usize| ((7 * t + 3 * s + t * s) % 11) as f32 / 11.0;
+        let before = Array2::from_shape_fn((24, 28), |(t, s)| texture(t, s));
+        for mosaic in MOSAICS {
+            let mut furthest = 0;
+            for at in [[12, 13], [12, 14], [13, 13], [13, 14], [0, 0], [23, 1]] {
+                for changed in [0.0, 0.5, 3.0] {
+                    let mut after = before.clone();
+                    after[at] = changed;
+                    let [before, after] =
+                        [&before, &after].map(|it| in_colour(it.view(), mosaic, Values::Light));
+                    for ((t, s, _), _) in
+                        before.indexed_iter().filter(|(place, value)| after[*place] != **value)
+                    {
+                        furthest = furthest.max(t.abs_diff(at[0]).max(s.abs_diff(at[1])));
+                    }
+                }
+            }
+            assert!((2..=REACH_PX).contains(&furthest), "{mosaic:?}: {furthest}");
+        }
+    }
+
+    #[test]
+    fn errors_keep_their_samples() {
+        let sds = Array2::from_shape_fn((6, 8), |(t, s)| (8 * t + s) as f32);
+        for mosaic in MOSAICS {
+            let found = in_colour(sds.view(), mosaic, Values::Errors);
+            for (place @ (t, s), sd) in sds.indexed_iter() {
+                assert_eq!(found[[t, s, channel(mosaic, place)]], *sd);
+            }
+        }
+    }
+
+    #[test]
+    fn nothing_is_known_beside_what_is_not_known() {
+        let mut bits = Array2::from_elem((10, 14), mask::MEASURED);
+        bits[[4, 4]] = 0;
+        let spread = mask_in_colour(bits, Mosaic::BayerRG);
+        assert_eq!((spread[[4, 4]], spread[[9, 0]], spread[[4, 10]]), (0, 0, mask::MEASURED));
+    }
+
+    #[test]
     fn what_is_interpolated_from_a_bound_is_no_more_than_a_bound() {
-        let mut bits = Array2::from_elem((9, 12), mask::MEASURED | mask::NO_EDGE);
+        let mut bits = Array2::from_elem((10, 14), mask::MEASURED | mask::NO_EDGE);
         bits[[4, 4]] = mask::BOUND_ONLY;
         let spread = mask_in_colour(bits.clone(), Mosaic::BayerRG);
-        assert_eq!((spread[[8, 0]], spread[[4, 9]]), (mask::BOUND_ONLY | mask::NO_EDGE, bits[[4, 9]]));
+        assert_eq!((spread[[9, 0]], spread[[4, 10]]), (mask::BOUND_ONLY | mask::NO_EDGE, bits[[4, 10]]));
         assert_eq!(mask_in_colour(bits.clone(), Mosaic::Mono), bits);
     }
 }

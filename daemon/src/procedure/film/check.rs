@@ -28,7 +28,9 @@ pub fn check(film: &FilmTask, products: &[ProductSpec], lab: &Lab<'_>) -> Result
     let cycles = of_cycles(film, lab.camera, model.reach());
     let memory = MemoryNeed::of_film(task).map_err(|error| task.refuse(&["film"], error.to_string()))?;
     let minutes = film.points() as f64 / cycles.transports_per_s / 60.0;
-    let image_bytes = (task.geometry.height * task.geometry.width) as u64 * BYTES_PER_PRODUCT_PIXEL;
+    let channels = task.mosaic.channels() as u64;
+    let image_bytes =
+        (task.geometry.height * task.geometry.width) as u64 * channels * BYTES_PER_PRODUCT_PIXEL;
     let product_bytes = (products.len() * film.points()) as u64 * image_bytes;
     let disk_bytes = (cycles.disk_bytes_per_minute as f64 * minutes) as u64 + product_bytes + OTHER_BYTES;
     let room = lab.room(memory.bytes(lab.memory_free_bytes()), disk_bytes);

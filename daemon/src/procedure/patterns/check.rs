@@ -30,8 +30,10 @@ pub fn check(patterns: &PatternsTask, lab: &Lab<'_>) -> Result<CheckReport, Conf
     let pixels = (task.geometry.height * task.geometry.width) as u64;
     let (images, settings) = (task.schedule.points.len() as u64, patterns.settings().len() as u64);
     // Images under pictures that are no checkerboards are written as one sequence for each setting.
-    let memory_bytes = pixels * (BYTES_PER_PX * settings + 12 * patterns.longest_captured() as u64);
-    let files = PRODUCTS * settings + 3 * patterns.captured() as u64 * settings;
+    let channels = task.mosaic.channels() as u64;
+    let memory_bytes =
+        pixels * (BYTES_PER_PX * settings + 12 * channels * patterns.longest_captured() as u64);
+    let files = channels * (PRODUCTS * settings + 3 * patterns.captured() as u64 * settings);
     let room = lab.room(memory_bytes, 4 * pixels * (images + files) + OTHER_BYTES);
     let (points, blind) = (patterns.points(), task.without_light());
     let mut warnings = Vec::new();

@@ -26,7 +26,8 @@ pub fn check(sweep: &SweepTask, products: &[ProductSpec], lab: &Lab<'_>) -> Resu
         MemoryNeed::of_sweep(task, products).map_err(|error| task.refuse(&["sweep"], error.to_string()))?;
     let memory_free_bytes = lab.memory_free_bytes();
     let pixels = (geometry.height * geometry.width) as u64;
-    let files = 2 * products.iter().map(|product| product.images(geometry) as u64).sum::<u64>();
+    let channels = task.mosaic.channels() as u64;
+    let files = 2 * channels * products.iter().map(|product| product.images(geometry) as u64).sum::<u64>();
     let images = task.schedule.points.len() as u64 + 2 * model.reach() + files;
     let room = lab.room(memory.bytes(memory_free_bytes), pixels * 4 * images + OTHER_BYTES);
 

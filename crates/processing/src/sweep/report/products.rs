@@ -5,7 +5,7 @@ use raysweep_core::Mosaic;
 use raysweep_pipeline::{CrossSection, Product, Profile, mask};
 use raysweep_session::report::{Block, ContactSheet, Marker, Picture, Plot, Section, Series, ToneMap};
 
-use crate::plane::colour::{Values, in_colour, sequence_in_colour};
+use crate::plane::colour::{Values, in_colour, mask_in_colour, sequence_in_colour};
 
 /// Percentile of the pixels that maps to white in a picture.
 pub(super) const PERCENTILE: f64 = 99.5;
@@ -20,7 +20,7 @@ pub(super) fn images(products: &[Product], mosaic: Mosaic, markers: &[Marker]) -
         .iter()
         .filter_map(|product| match product {
             Product::Image { name, about, is_light, image, mask } => {
-                let bounds = mask.mapv(|bits| bits & mask::BOUND_ONLY != 0);
+                let bounds = mask_in_colour(mask.clone(), mosaic).mapv(|bits| bits & mask::BOUND_ONLY != 0);
                 let values = if *is_light { Values::Light } else { Values::Errors };
                 let image = in_colour(image.view(), mosaic, values);
                 let tone_map = ToneMap::percentile(&image.axis_iter(Axis(2)).collect::<Vec<_>>(), PERCENTILE);
