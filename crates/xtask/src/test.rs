@@ -20,7 +20,7 @@ pub enum Guest {
     Skip,
 }
 
-/// Installs missing packages, then checks format, lints, fuzz targets, tests, doc tests, and tests in both guests.
+/// Installs missing packages, then checks format, lints, tests, doc tests, and tests in both guests.
 pub fn test(wanted: Guest) -> Done {
     has_components()?;
     has_networks()?;
@@ -31,8 +31,6 @@ pub fn test(wanted: Guest) -> Done {
     run(cargo().args(["fmt", "--all", "--check"]))?;
     run(cargo().args(["clippy", "--workspace", "--all-targets", "--", "-D", "warnings"]))?;
     run(cargo().args(["clippy", "--workspace", "--all-targets", "--all-features", "--", "-D", "warnings"]))?;
-    // A separate workspace, which nothing else compiles; in the same folder, it shares what the lints have built.
-    run(cargo().args(["check", "--manifest-path", "fuzz/Cargo.toml", "--target-dir"]).arg(target()))?;
     let built = binaries::build()?;
     has_space()?;
     // All failures at once: the next look at them is far away.
