@@ -27,10 +27,10 @@ pub struct Columns {
     groups: Vec<Range<usize>>,
     /// `[row * groups + group]`.
     cells: Vec<Cell>,
-    /// Cumulative responses, `[row * groups + group, rows]`.
-    cumulative: Array2<f64>,
-    /// The fraction of each row's dwell that has passed when half of its light has been sent, of the same shape.
-    middles: Array2<f64>,
+    /// The drawn rows of each cell's response and their end, `[row * groups + group][rows + 1]`.
+    drawn: Vec<DrawnRow>,
+    /// `rows + 1`.
+    drawn_rows: usize,
     /// Mean variance of a single pixel of a cell in each picture of its response, in squares of its light,
     /// `[row * groups + group, 17]`.
     picture_variances: Array2<f64>,
@@ -53,6 +53,15 @@ pub(super) struct Cell {
     dwell: f64,
     /// Standard deviation of a row's light sent while it passes the cell, as a share of it.
     step_sd: f64,
+}
+
+/// A row of a cell's response.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct DrawnRow {
+    /// What earlier rows have sent.
+    before: f64,
+    /// The fraction of its dwell that has passed when half of its light has been sent.
+    middle: f64,
 }
 
 /// Shares of a cell's light.
@@ -153,14 +162,12 @@ impl Columns {
             }
         }
         let longest = responses.iter().map(Vec::len).max().unwrap_or(0);
-        let mut cumulative = Array2::zeros((cells.len(), longest + 1));
-        let mut middles = Array2::from_elem((cells.len(), longest), 0.5);
-        for (mut middles, passes) in middles.outer_iter_mut().zip(&passes) {
-            middles.iter_mut().zip(passes).for_each(|(middle, passed)| *middle = *passed);
-        }
-        for (mut cumulative, response) in cumulative.outer_iter_mut().zip(&responses) {
-            for index in 0..longest {
-                cumulative[index + 1] = cumulative[index] + response.get(index).unwrap_or(&0.0);
+        let mut drawn = Vec::with_capacity(cells.len() * (longest + 1));
+        for (response, passes) in responses.iter().zip(&passes) {
+            let mut before = 0.0;
+            for row in 0..=longest {
+                drawn.push(DrawnRow { before, middle: passes.get(row).copied().unwrap_or(0.5) });
+                before += response.get(row).unwrap_or(&0.0);
             }
         }
         let mut reach = vec![(f64::MAX, f64::MIN); rows];
@@ -176,8 +183,8 @@ impl Columns {
             lit,
             groups,
             cells,
-            cumulative,
-            middles,
+            drawn,
+            drawn_rows: longest + 1,
             reach,
         })
     }
@@ -289,22 +296,22 @@ impl Columns {
     pub(super) fn light_before(&self, row: usize, group: usize, drawn: f64) -> LightSent {
         let index = row * self.groups.len() + group;
         let cell = &self.cells[index];
-        let cumulative = self.cumulative.row(index);
         let steady = |sent: f64| LightSent { sent, sending: 0.0, sd: 0.0 };
         let from_first = drawn - cell.first_row as f64;
         if from_first <= 0.0 {
             return steady(0.0);
         }
-        let whole = from_first as usize;
+        let (whole, drawn) = (from_first as usize, self.drawn_of(index));
         if whole >= cell.rows {
-            return steady(cumulative[cell.rows]);
+            return steady(drawn[cell.rows].before);
         }
-        let share = cumulative[whole + 1] - cumulative[whole];
+        let (before, after) = (drawn[whole].before, drawn[whole + 1].before);
+        let share = after - before;
         match self.part_sent(index, whole, from_first) {
-            ..=0.0 => steady(cumulative[whole]),
-            1.0.. => steady(cumulative[whole + 1]),
+            ..=0.0 => steady(before),
+            1.0.. => steady(after),
             part => LightSent {
-                sent: cumulative[whole] + part * share,
+                sent: before + part * share,
                 sending: share / cell.dwell,
                 sd: share * cell.step_sd,
             },
@@ -317,7 +324,12 @@ impl Columns {
     /// beyond 1 after its end.
     #[inline]
     fn part_sent(&self, index: usize, row: usize, from_first: f64) -> f64 {
-        (from_first - row as f64 - self.middles[[index, row]]) / self.cells[index].dwell + 0.5
+        (from_first - row as f64 - self.drawn_of(index)[row].middle) / self.cells[index].dwell + 0.5
+    }
+
+    #[inline]
+    fn drawn_of(&self, index: usize) -> &[DrawnRow] {
+        &self.drawn[index * self.drawn_rows..][..self.drawn_rows]
     }
 
     /// What the light of a cell would have more, when `drawn` rows (with a fraction) have been drawn, if each of the

@@ -25,8 +25,9 @@ const COEFFICIENT_PRIOR_US: f64 = 30.0;
 const SMOOTHNESS: f64 = 0.003;
 /// Largest step of a coefficient or of a frame's jitter.
 const STEP_US: f64 = 8.0;
-/// Steps of the table below this end the fit: a quarter of the smallest standard deviation that it states of a row.
-const CONVERGED_US: f64 = 0.001;
+/// Shorter steps end the fit. The standard deviations are those of independent residuals, several times smaller than the
+/// stated ones.
+const CONVERGED_SDS: f64 = 0.07;
 const MAX_STEPS: usize = 20;
 /// Frames whose share in the normal equations is summed on one core. The same on every machine, as are the sums.
 const FRAMES_TOGETHER: usize = 16;
@@ -286,22 +287,31 @@ impl<'a> Fit<'a> {
         }
     }
 
-    /// Joint steps until they are small, at most `limit`.
+    /// Joint steps until they are short, at most `limit`.
     fn steps(&mut self, limit: usize, free: bool) -> Result<(), TimesError> {
+        let (mut part, mut last_sds) = (1.0, f64::INFINITY);
         for _ in 0..limit {
             let Normal { matrix, right, frames } = self.normal(free);
             let mut step = matrix.cholesky().ok_or(TimesError::Undetermined)?.solve(&right);
-            step.rows_mut(0, self.table.coefficients).apply(|step| *step = step.clamp(-STEP_US, STEP_US));
             if step.iter().any(|step| !step.is_finite()) {
                 return Err(TimesError::Undetermined);
             }
-            self.unknowns.iter_mut().zip(&step).for_each(|(unknown, step)| *unknown += step);
+            // The root of the Newton decrement: no unknown, and no sum of them, moves by more of its standard deviations.
+            let length_sds = right.dot(&step).sqrt();
+            let mut coefficients = step.rows_mut(0, self.table.coefficients);
+            // Derivatives jump where an edge passes from row to row, and whole steps may lead to and fro across one.
+            if coefficients.amax() < STEP_US && length_sds > last_sds / 2.0 {
+                part /= 2.0;
+            }
+            last_sds = length_sds;
+            coefficients.apply(|step| *step = step.clamp(-STEP_US, STEP_US));
+            self.unknowns.iter_mut().zip(&step).for_each(|(unknown, step)| *unknown += part * step);
             for FrameNormal { frame, mixed, weight, right } in &frames {
                 let late_us = (right - mixed.dot(&step)) / weight;
-                self.late_us[*frame] += late_us.clamp(-STEP_US, STEP_US);
+                self.late_us[*frame] += part * late_us.clamp(-STEP_US, STEP_US);
                 self.jitter_weight[*frame] = weight - self.jitter_prior_us.powi(-2);
             }
-            if step.rows(0, self.table.coefficients).amax() < CONVERGED_US {
+            if part * length_sds < CONVERGED_SDS {
                 break;
             }
         }

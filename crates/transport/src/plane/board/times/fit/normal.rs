@@ -53,7 +53,7 @@ impl FrameNormal {
 /// Derivative of an edge's time, relative to the light, to the unknowns.
 #[derive(Default)]
 pub(super) struct Sparse {
-    entries: [(usize, f64); 12],
+    entries: [(usize, f64); 8],
     count: usize,
 }
 
@@ -69,10 +69,14 @@ impl Sparse {
 
     /// The light is late by the table at the place that is being drawn at the edge, not at the pixel's place.
     pub(super) fn add_table(&mut self, table: &SplineTable, edge: &ExposureEdge) {
-        for (row, share) in [(edge.row, 1.0 - edge.fraction), (edge.row + 1, edge.fraction)] {
-            let (first, weights) = table.weights(row);
-            weights.iter().enumerate().for_each(|(index, weight)| self.push(first + index, -share * weight));
-        }
+        let (first, of_row) = table.weights(edge.row);
+        let (of_next_first, of_next) = table.weights(edge.row + 1);
+        // The two rows have their coefficients in common, or all but one: each entry costs as many products as there are.
+        let mut sums = [0.0; 5];
+        sums.iter_mut().zip(of_row).for_each(|(sum, weight)| *sum = -(1.0 - edge.fraction) * weight);
+        let later = of_next_first - first;
+        sums[later..].iter_mut().zip(of_next).for_each(|(sum, weight)| *sum -= edge.fraction * weight);
+        sums[..4 + later].iter().enumerate().for_each(|(index, sum)| self.push(first + index, *sum));
     }
 }
 
