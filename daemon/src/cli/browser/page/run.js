@@ -10,6 +10,7 @@ const UNDER_WAY = ["preparing", "armed", "running", "paused", "draining"];
 
 /** Nobody ends a viewfinder whose tab was closed: it ends by itself, with its light, after an hour. */
 const FINDER = "kind = \"viewfinder\"\n[viewfinder]\nseconds = 3600\n";
+const ALIGN = `${FINDER}picture = "align"\nsubject = "board"\n`;
 
 /** What `raysweep calibrate` runs. */
 const CALIBRATION = "kind = \"calibration\"\n";
@@ -52,6 +53,7 @@ export function startRun() {
   by("check").addEventListener("click", check);
   by("start").addEventListener("click", () => start(by("plan").value));
   by("find").addEventListener("click", () => start(FINDER));
+  by("align").addEventListener("click", () => start(ALIGN));
   by("calibrate").addEventListener("click", () => start(CALIBRATION));
   watchPictures(startFinder(order));
   setInterval(() => { if (!document.hidden) refresh(); }, 2000);
@@ -127,8 +129,8 @@ function draw() {
   by("pause").disabled = !["armed", "running"].includes(state);
   by("continue").disabled = state !== "paused" || Boolean(question?.wants_answer);
   by("cancel").disabled = !isUnderWay;
-  for (const id of ["start", "check", "find", "calibrate"]) by(id).disabled = isUnderWay || !state;
-  by("calibrate").hidden = status.rig !== "plane";
+  for (const id of ["start", "check", "find", "align", "calibrate"]) by(id).disabled = isUnderWay || !state;
+  for (const id of ["align", "calibrate"]) by(id).hidden = status.rig !== "plane";
   // A viewfinder stores nothing.
   const stores = Boolean(progress?.points_planned);
   by("progress").hidden = !stores;
@@ -199,7 +201,7 @@ function tellChecked(...parts) {
 const mistakes = (error) => (error.data?.mistakes ?? [error]).map(({ message }) => note("bad", message));
 
 async function start(plan) {
-  for (const id of ["start", "find", "calibrate"]) by(id).disabled = true;
+  for (const id of ["start", "find", "align", "calibrate"]) by(id).disabled = true;
   const { error } = await call("run", { plan });
   tellChecked(...(error ? mistakes(error) : []));
   complaint = null;
@@ -254,7 +256,7 @@ async function watchPictures({ onregion, onmarks }) {
   tellAbout = () => {
     if (!shown) return;
     const session = nameOf(shown.about.session);
-    const isOld = UNDER_WAY.includes(status.state) && session !== nameOf(status.session);
+    const isOld = session !== nameOf(status.session);
     picture.element.classList.toggle("old", isOld);
     by("live-about").textContent = (isOld ? "of an earlier run: " : "") + describe(shown);
   };

@@ -225,8 +225,9 @@ function compared(one, two, [first, second]) {
   const sides = [[first, one], [second, two]].map(([label, picture]) => ({ title: label, label, picture, range }));
   if (one.shape.join() !== two.shape.join()) return sides;
   const values = one.values.map((value, at) => two.values[at] - value);
-  const square = (value) => (Number.isFinite(value) ? value * value : 0);
-  const rms = Math.sqrt(values.reduce((sum, value) => sum + square(value), 0) / values.length);
+  // Pixels without a value in both have no difference.
+  const known = values.filter(Number.isFinite);
+  const rms = Math.sqrt(known.reduce((sum, value) => sum + value * value, 0) / known.length);
   const title = `second − first, RMS ${number(rms)}`;
   const label = "the difference, second − first";
   return [...sides, { title, label, picture: { ...one, values }, colours: "difference", symmetric: true }];
