@@ -292,8 +292,12 @@ fn a_camera_that_runs_freely_needs_neither_an_edge_nor_a_watcher() {
             assert_eq!(values.problem, None);
         }
         view.show(FinderPicture::Align);
-        let problem = view.picture(|values| values.problem.is_some()).problem.unwrap();
+        let complaint = view.picture(|values| values.problem.is_some());
+        let problem = complaint.problem.unwrap();
         assert!(problem.contains("needs trigger = \"vsync\""), "{problem}");
+        // The figures beside it are those of the picture before, and named as such.
+        assert_eq!(complaint.picture, FinderPicture::White);
+        assert!((complaint.mean_dn / 2564.0 - 1.0).abs() < 0.02, "{}", complaint.mean_dn);
         view.show(FinderPicture::White);
         view.picture(|values| values.picture == FinderPicture::White && values.problem.is_none());
         view.runner.cancel().unwrap();

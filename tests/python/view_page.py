@@ -16,6 +16,7 @@ LONG = plan.replace("average = 4", "average = 400")
 assert LONG != plan
 SHORT = "kind = \"sweep\"\nname = \"asked\"\n[sweep]\ndelay_us = [-300, 0, 300]\nexposure_us = [500]\naverage = 2\n"
 FILM = "kind = \"film\"\nname = \"film\"\n[film]\ncycles = 5\n[[product]]\nname = \"epipolar\"\nkind = \"epipolar\"\n"
+DARKS = "kind = \"darks\"\nname = \"darks\"\n[darks]\nexposure_us = [100]\nframes = 2\n"
 SCHEMES = ["light", "dark"]
 WIDTHS = [1280, 400]
 
@@ -86,6 +87,7 @@ def first_visit(page):
     expect(page.locator("#notes")).to_contain_text("The run is complete.")
     expect(page.locator("#notes")).to_contain_text("not calibrated")
     expect(page.locator("#figures")).to_contain_text("30 of 30")
+    expect(page.locator("#figures dt").first).to_have_text("measurements")
     expect(page.locator("#live-names button")).to_have_count(3)
     expect(page.locator("#live-picture canvas.image")).to_be_visible()
     page.locator("#live-picture canvas.image").hover(position={"x": 60, "y": 60})
@@ -120,6 +122,12 @@ def viewfinder(page):
     shots(page, "viewfinder")
     page.click("#finder-whole")
     expect(figures).to_contain_text("rows 0 to 47, columns 0 to 31")
+    page.click("#cancel")
+    expect(page.locator("#finder")).to_be_hidden()
+    # A simulated rig has its board placed without a question.
+    page.click("#align")
+    shown = page.get_by_role("button", name="align", exact=True)
+    expect(shown).to_have_attribute("aria-pressed", "true")
     page.click("#cancel")
     expect(page.locator("#finder")).to_be_hidden()
 
@@ -174,6 +182,18 @@ def videos(page):
     shots(page, "film")
 
 
+def earlier_picture(page):
+    """A run without live pictures leaves that of the run before, which stays marked when it has ended."""
+    page.goto(address)
+    about = page.locator("#live-about")
+    run(page, FILM)
+    expect(about).to_contain_text("px")
+    expect(about).not_to_contain_text("of an earlier run")
+    run(page, DARKS)
+    expect(page.locator("#state")).to_have_text("idle")
+    expect(about).to_contain_text("of an earlier run")
+
+
 def many_tabs(context):
     """Tabs that are not seen hold none of the six connections that a browser has to an address."""
     tabs = [context.new_page() for _ in range(8)]
@@ -217,6 +237,7 @@ def visit(page, name):
     page.keyboard.press("ArrowDown")
     expect(page.locator("#session .u-wrap")).to_be_visible()
     page.locator("#sessions li", has_text="groove").nth(1).get_by_role("button", name="compare").click()
+    expect(page.locator("#session h3").nth(0)).to_contain_text("1 = a white pixel lit by its own projector row")
     expect(page.locator("#session h3").nth(2)).to_contain_text("RMS")
     expect(page.locator("#session .differences th")).to_have_count(3)
     expect(page.locator("#session .differences tr", has_text="kind")).to_have_count(0)
@@ -243,6 +264,7 @@ with sync_playwright() as playwright:
             questions(page)
             warnings(page)
             videos(page)
+            earlier_picture(page)
             many_tabs(context)
         visit(page, f"{scheme}-{width}")
         context.close()

@@ -277,6 +277,7 @@ fn a_cancelled_calibration_leaves_the_one_in_use() {
     let _ = Control::cancel(&*bench.runner);
     let cancelled = end_of(&mut events);
     assert_eq!(cancelled.state, "cancelled");
+    assert!(!cancelled.open().1.end.unwrap().is_final);
     assert!(!cancelled.session.join("calibration.toml").exists());
     assert_eq!(kept(&current_in(&bench.folder.path().join("sessions"))), kept(&first.session));
 }
@@ -293,8 +294,10 @@ fn a_board_or_light_of_no_use_is_refused_with_the_reason() {
         let message = message(&ended);
         assert!(message.contains("not calibrated") && message.contains(expected), "{message}");
         assert!(!current_in(&bench.folder.path().join("sessions")).exists());
-        // What was taken is kept.
-        assert!(ended.open().1.stored(ArrayName::Sum).count() > 0);
+        // What was taken is kept, and would be refused again.
+        let (_, state) = ended.open();
+        assert!(state.stored(ArrayName::Sum).count() > 0 && state.missing_points() > 0);
+        assert!(state.end.unwrap().is_final, "{more}");
     }
 }
 

@@ -93,7 +93,7 @@ fn every_picture_has_its_images_and_sessions_are_resumed_to_the_same_bits() {
                   [[pattern]]\nkind = \"stripes\"\nperiod_px = 16\n\
                   [[pattern]]\nkind = \"phase-shift\"\nperiod_px = 32\nsteps = 4\n\
                   [[pattern]]\nkind = \"gray-code\"\n";
-    let plan = plan("[600, 1200]", series);
+    let plan = plan("[600, 1200.5]", series);
     let ended = bench.run(&plan);
     let (_, state) = ended.open();
     // 3 settings under 3 single pictures, 4 shifts, and 7 bits with their inverses.
@@ -120,8 +120,11 @@ fn every_picture_has_its_images_and_sessions_are_resumed_to_the_same_bits() {
     let brightest = (0..128).max_by(|&a, &b| line.row(a).sum().total_cmp(&line.row(b).sum())).unwrap();
     assert_eq!(brightest, 40, "the row that is lit");
 
-    let files =
-        ["stripes-regular.npy", "phase-shift-rows-delay_0us_exposure_1200us.npy", "line-40-regular_mask.npy"];
+    let files = [
+        "stripes-regular.npy",
+        "phase-shift-rows-delay_0us_exposure_1200p5us.npy",
+        "line-40-regular_mask.npy",
+    ];
     let before = files.map(read);
     let ledger = ended.session.join("ledger.jsonl");
     let lines: Vec<String> = fs::read_to_string(&ledger).unwrap().lines().map(str::to_owned).collect();

@@ -279,6 +279,9 @@ pub struct CheckReport {
     /// chosen.
     #[serde(default)]
     pub settings_refused: Option<String>,
+    /// Counts above black of a white pixel under its own row, as sweeps and films take them; `None` for other plans.
+    #[serde(default)]
+    pub white_dn: Option<f64>,
     /// First and last relative row that a plane rig's plan covers; `None` on a dot rig.
     #[serde(default)]
     pub reach_rows: Option<(i32, i32)>,
@@ -467,6 +470,9 @@ pub enum Event {
         stored: usize,
         /// Sweep points missing.
         missing: usize,
+        /// Whether the session cannot be resumed, or would come to the same end.
+        #[serde(default)]
+        is_final: bool,
         /// Summary of the film, if the run was a film.
         #[serde(default)]
         film: Option<FilmSummary>,

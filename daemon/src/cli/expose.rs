@@ -62,7 +62,7 @@ pub(super) fn expose(socket: &Path, path: &Path, printer: Printer) -> Result<Exi
         let message = "the plan has no exposures to choose: give a plan of kind \"sweep\" or \"film\"";
         return Err(CommandFailure::Exposure(message.into()));
     };
-    let tried = Trial::begin(socket)?.longest(shortest_us, longest_us, &delays_us)?;
+    let tried = Trial::begin(socket, foreseen.white_dn)?.longest(shortest_us, longest_us, &delays_us)?;
     let limited = limited(&text, tried.exposure_us)?;
     let foreseen = client.check(&limited).map_err(|error| CommandFailure::of_plan(error, path, &limited))?;
     let (plan, average) = averaged(&limited, &foreseen)?;
@@ -199,6 +199,8 @@ struct Trial {
     events: Subscription,
     interrupts: Interrupts,
     pictures: u64,
+    /// Counts above black of white, as the plan's run takes them: with the calibration, which a viewfinder does without.
+    white_dn: Option<f64>,
     /// Exposure and delay asked for.
     settings_us: Option<(f64, f64)>,
     /// The viewfinder's session.
@@ -207,14 +209,15 @@ struct Trial {
 }
 
 impl Trial {
-    fn begin(socket: &Path) -> Result<Self, CommandFailure> {
+    fn begin(socket: &Path, white_dn: Option<f64>) -> Result<Self, CommandFailure> {
         let mut events = Client::connect(socket)?.subscribe()?;
         let interrupts = Interrupts::of_any_end().map_err(CommandFailure::Signals)?;
         let client = Client::connect(socket)?;
         let plan = RunParams { plan: VIEWFINDER.into(), attached: true, ..RunParams::default() };
         let session = events.client().run(&plan)?.session;
+        let (pictures, settings_us, is_over) = (0, None, false);
         let mut trial =
-            Self { client, events, interrupts, pictures: 0, settings_us: None, session, is_over: false };
+            Self { client, events, interrupts, pictures, white_dn, settings_us, session, is_over };
         trial.picture()?;
         Ok(trial)
     }
@@ -287,7 +290,8 @@ impl Trial {
             let pixels = values.histogram.iter().sum::<u64>() as f64;
             samples += pixels;
             saturated += values.saturated * pixels;
-            headroom = headroom.min(headroom_of(&values)).min(headroom_of_board(&values));
+            let of_board = headroom_of_board(&values, self.white_dn.or(values.white_dn));
+            headroom = headroom.min(headroom_of(&values)).min(of_board);
         }
         let suits =
             saturated == 0.0 || saturated + CONFIDENCE * (saturated + 1.0).sqrt() <= MAX_SATURATED * samples;
@@ -375,10 +379,10 @@ fn headroom_of(values: &ViewfinderValues) -> f64 {
     (values.saturation_dn - values.black_dn) / (level_dn - values.black_dn).max(1.0)
 }
 
-/// By how much the light could grow until a white board has more than a calibration takes.
-fn headroom_of_board(values: &ViewfinderValues) -> f64 {
+/// By how much the light could grow until a white board, of so many counts above black, has more than a calibration takes.
+fn headroom_of_board(values: &ViewfinderValues, white_dn: Option<f64>) -> f64 {
     let most_dn = MOST_OF_BOARD * f64::from(values.full_dn) - values.black_dn;
-    values.white_dn.map_or(f64::INFINITY, |white_dn| most_dn / white_dn)
+    white_dn.map_or(f64::INFINITY, |white_dn| most_dn / white_dn)
 }
 
 /// What is proposed.
@@ -497,8 +501,7 @@ mod tests {
         values.brightest_dn = 2000;
         assert!((headroom_of(&values) - of(2000.0)).abs() < 1e-9);
         // The simulated rig's white board has 58 % of full scale.
-        assert_eq!(headroom_of_board(&values), f64::INFINITY);
-        values.white_dn = Some(2300.0);
-        assert!((headroom_of_board(&values) - 1.1295).abs() < 1e-4);
+        assert_eq!(headroom_of_board(&values, None), f64::INFINITY);
+        assert!((headroom_of_board(&values, Some(2300.0)) - 1.1295).abs() < 1e-4);
     }
 }

@@ -388,6 +388,7 @@ pub(super) struct Ending<'a> {
     pub report: Option<&'a Path>,
     pub stored: usize,
     pub missing: usize,
+    pub is_final: bool,
     pub final_s: Option<f64>,
     pub light_s: Option<f64>,
     pub simulated_time: bool,
@@ -396,7 +397,8 @@ pub(super) struct Ending<'a> {
 impl Ending<'_> {
     /// Text for the end of a run.
     pub(super) fn text(&self) -> String {
-        let Self { session, state, report, stored, missing, final_s, light_s, simulated_time } = *self;
+        let Self { session, state, report, stored, missing, is_final, final_s, light_s, simulated_time } =
+            *self;
         let clock = if simulated_time { " (simulated time)" } else { "" };
         let mut lines = vec![match stored + missing {
             0 => format!("{state}: a viewfinder stores no images"),
@@ -411,7 +413,7 @@ impl Ending<'_> {
         );
         lines.extend(final_s.map(|seconds| format!("transport on disk {seconds:.2} s after the last frame")));
         lines.extend(report.map(|report| format!("report: {}", report.display())));
-        if missing > 0 {
+        if missing > 0 && !is_final {
             lines.push(format!("`raysweep resume {}` acquires the missing points", name(session)));
         }
         lines.join("\n")
@@ -560,6 +562,7 @@ mod tests {
             report: None,
             stored: 40,
             missing: 35,
+            is_final: false,
             final_s: None,
             light_s: None,
             simulated_time: false,
@@ -575,6 +578,7 @@ mod tests {
             ..unfinished
         };
         let simulated = Ending { simulated_time: true, ..complete }.text();
+        assert!(!Ending { is_final: true, ..unfinished }.text().contains("resume"));
         let (unfinished, complete) = (unfinished.text(), complete.text());
         assert!(unfinished.contains("35 missing") && unfinished.contains("resume 20260101-000000_corner"));
         assert!(

@@ -18,6 +18,8 @@ const MOST_PICTURE_BYTES: u64 = (4 << 24) + (1 << 16);
 const MOST_ABOUT_BYTES: u64 = 1 << 24;
 /// Pictures that say most of a session, best first.
 const BEST: [&str; 4] = ["epipolar", "regular", "floodlit", "direct"];
+/// Names of those that say least begin so: the projector was black.
+const LEAST: &str = "black-";
 /// The brightest half per cent of the pixels is white.
 const WHITE_PERCENT: f64 = 99.5;
 
@@ -36,8 +38,14 @@ pub(super) fn pictures(session: &Session) -> Vec<String> {
         .filter(|name| Products::is_name(name))
         .collect();
     names.sort();
-    names.sort_by_key(|name| BEST.iter().position(|best| best == name).unwrap_or(BEST.len()));
+    names.sort_by_key(|name| rank(name));
     names
+}
+
+/// Small for pictures that say much.
+fn rank(name: &str) -> usize {
+    let best = BEST.iter().position(|best| *best == name);
+    best.unwrap_or(BEST.len() + usize::from(name.starts_with(LEAST)))
 }
 
 /// What is known of a product; null if nothing is.
@@ -117,4 +125,16 @@ pub(super) fn write(session: &Session, folder: &Path) -> Result<Vec<PathBuf>, Co
         written.push(path);
     }
     Ok(written)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::rank;
+
+    #[test]
+    fn pictures_without_light_come_last() {
+        let mut names = ["black-regular", "direct", "gray-code-rows-regular"];
+        names.sort_by_key(|name| rank(name));
+        assert_eq!(names, ["direct", "gray-code-rows-regular", "black-regular"]);
+    }
 }

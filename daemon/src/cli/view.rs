@@ -92,6 +92,7 @@ impl EventView {
                 report,
                 stored,
                 missing,
+                is_final,
                 film,
                 warnings,
                 found,
@@ -114,8 +115,19 @@ impl EventView {
                     None => {
                         let (report, stored, missing) = (report.as_deref(), *stored, *missing);
                         let (final_s, light_s, simulated_time) = (*final_s, *light_s, *simulated_time);
-                        Ending { session, state, report, stored, missing, final_s, light_s, simulated_time }
-                            .text()
+                        let is_final = *is_final;
+                        Ending {
+                            session,
+                            state,
+                            report,
+                            stored,
+                            missing,
+                            is_final,
+                            final_s,
+                            light_s,
+                            simulated_time,
+                        }
+                        .text()
                     }
                 };
                 writeln!(io::stdout(), "{}", printable(&summary))?;

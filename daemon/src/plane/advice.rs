@@ -11,7 +11,7 @@ use raysweep_proto::{
 };
 use raysweep_transport::plane::advice::{
     Arrangement, Calibrated, Conditions, Design, Noise, PredictedError, Proposal, Search, Spread, Usable,
-    white_light,
+    sees_own_row, white_light,
 };
 use raysweep_transport::plane::board::CalibrationParameter;
 use raysweep_transport::plane::{Demux, PlaneError, Setting};
@@ -47,7 +47,7 @@ pub trait Searched: Clone + Sync {
 pub enum NoAdvice {
     /// Nothing is left to demultiplex.
     #[error(
-        "the errors cannot be predicted: every setting saturates a white pixel, or begins or ends while a flying spot draws the direct row; lower camera.white_dn (gain, aperture) or move the delays by a few rows"
+        "the errors cannot be predicted: every setting that sees a pixel's own row saturates where that is white and lit by its surroundings, or begins or ends while a flying spot draws it; scenes without such pixels are measured all the same, and under a flying spot, move the delays by a few rows"
     )]
     NothingUsable,
     /// The prediction would take too long.
@@ -328,6 +328,12 @@ impl<'a, T: Searched> Adviser<'a, T> {
         let mut index = 0..;
         settings
             .retain(|setting| index.next().is_some_and(|index| cut.keeps(index)) && !self.saturates(setting));
+        // All direct light would be error, though pixels that are darker than white are measured.
+        let planned = design.settings();
+        let sees_direct = |settings: &[Setting]| settings.iter().any(|setting| sees_own_row(timing, setting));
+        if settings.len() < planned.len() && sees_direct(&planned) && !sees_direct(&settings) {
+            settings.clear();
+        }
         Some(Usable { settings, noise: self.noise(other, design.frames) })
     }
 

@@ -186,6 +186,7 @@ impl Room {
             disk_free_bytes,
             settings: None,
             settings_refused: None,
+            white_dn: None,
             reach_rows: None,
             condition: None,
             // Computed only on request: a run must not wait for it.

@@ -203,6 +203,7 @@ fn finish(Ended { end, found }: Ended, board: &StatusBoard, dir: &Path) {
         report: report.exists().then_some(report),
         stored: end.stored,
         missing: end.missing,
+        is_final: end.is_final,
         film: board.status().film,
         warnings: end.warnings,
         found,

@@ -70,6 +70,7 @@ impl Fake {
             report,
             stored: 75 - missing,
             missing,
+            is_final: false,
             film: None,
             warnings: Vec::new(),
             found: Vec::new(),
@@ -162,6 +163,7 @@ pub fn report() -> CheckReport {
         disk_free_bytes: 1 << 40,
         settings: Some("[sweep]\naverage = 4\n".into()),
         settings_refused: None,
+        white_dn: None,
         reach_rows: Some((-94, 94)),
         condition: Some(1234.5),
         advice: Some(PlanAdvice {

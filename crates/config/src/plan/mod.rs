@@ -13,7 +13,7 @@ mod viewfinder;
 
 use serde::Deserialize;
 use serde_json::Map;
-use toml_edit::{DocumentMut, Item, Table, TomlError};
+use toml_edit::{DocumentMut, Item, Table, TomlError, Value};
 
 pub use self::batches::{BatchesPlan, PathPlan, PlanePlan, Shape};
 pub use self::calibration::CalibrationPlan;
@@ -257,7 +257,8 @@ impl Plan {
 }
 
 /// A plan's text with other tables, those of the text `tables`, in place of its own. Comments stay, except those above and
-/// in tables that get tables of their own, and those of keys that the other tables do not have.
+/// in tables that get tables of their own, those of keys that the other tables do not have, and those beside values that
+/// are others then.
 ///
 /// # Errors
 /// If one of the texts is not TOML.
@@ -290,14 +291,29 @@ fn replace_values(own: &mut Table, other: &Table) {
     for (key, item) in other {
         match (own.get_mut(key).and_then(Item::as_value_mut), item.as_value()) {
             (Some(own), Some(value)) => {
-                let decor = own.decor().clone();
-                *own = value.clone();
-                *own.decor_mut() = decor;
+                if !is_same(own, value) {
+                    let mut decor = own.decor().clone();
+                    decor.set_suffix("");
+                    *own = value.clone();
+                    *own.decor_mut() = decor;
+                }
             }
             _ => {
                 own.insert(key, item.clone());
             }
         }
+    }
+}
+
+/// Whether two values are the same, however they are written.
+fn is_same(a: &Value, b: &Value) -> bool {
+    let number = |value: &Value| value.as_float().or(value.as_integer().map(|whole| whole as f64));
+    let text = |value: &Value| -> String {
+        value.clone().decorated("", "").to_string().split_whitespace().collect()
+    };
+    match (number(a), number(b)) {
+        (Some(a), Some(b)) => a == b,
+        _ => text(a) == text(b),
     }
 }
 
@@ -315,7 +331,8 @@ mod tests {
         let commented = "kind = \"sweep\" # why\n# The grid.\n[sweep]\naverage = 2 # few\n\n[[stage]]\nname = \"demux\"\n";
         let (few, extra) =
             ("[sweep]\naverage = 3\n", "\n[[sweep.extra]]\ndelay_us = [0]\nexposure_us = [1]\n");
-        assert_eq!(with_tables(commented, few).unwrap(), commented.replace('2', "3"));
+        assert_eq!(with_tables(commented, few).unwrap(), commented.replace("2 # few", "3"));
+        assert_eq!(with_tables(commented, "[sweep]\naverage = 2.0\n").unwrap(), commented);
         for own in [
             commented,
             "kind = \"sweep\" # why\nsweep.average = 2\n",

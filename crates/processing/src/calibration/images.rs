@@ -51,6 +51,13 @@ pub enum CalibrationError {
     Session(#[from] raysweep_session::Error),
 }
 
+impl CalibrationError {
+    /// Whether the same images will always be refused: what is missing or damaged may be taken again.
+    pub fn is_final(&self) -> bool {
+        !matches!(self, Self::Image(_) | Self::Session(_))
+    }
+}
+
 /// The images of a session.
 pub struct BoardImages<'a> {
     /// The task that they belong to.

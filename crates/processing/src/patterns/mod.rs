@@ -226,6 +226,9 @@ fn write_separated(
         let image = in_colour(image, mosaic, values.unwrap_or(Values::Errors));
         let bits = mask_in_colour(bits.clone(), mosaic);
         let mut metadata = task.task.metadata();
+        if values.is_none() {
+            metadata.insert("units".into(), json!("projector pixels"));
+        }
         metadata.insert("axes".into(), json!(axes(mosaic)));
         metadata.insert("about".into(), json!(about));
         metadata.insert(

@@ -149,7 +149,8 @@ fn settings(patterns: &PatternsPlan, period_us: f64) -> Vec<PictureSetting> {
     let grid = patterns.settings_us();
     let name = |(delay_us, exposure_us): (f64, f64)| match grid[..] {
         [(0.0, _)] => EPIPOLAR.to_owned(),
-        _ => format!("delay_{delay_us}us_exposure_{exposure_us}us"),
+        // Names of products have no points.
+        _ => format!("delay_{delay_us}us_exposure_{exposure_us}us").replace('.', "p"),
     };
     let regular = PictureSetting { name: REGULAR.into(), delay_us: 0.0, exposure_us: period_us };
     let gated = grid.iter().map(|&(delay_us, exposure_us)| PictureSetting {

@@ -218,6 +218,9 @@ pub struct EndEntry {
     /// Why it faulted.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub error: Option<String>,
+    /// Whether a resumed run would come to the same end.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub is_final: bool,
     /// Sweep points stored by now.
     pub stored: usize,
     /// Sweep points planned and not stored.
@@ -256,6 +259,7 @@ impl EndEntry {
         Self {
             state,
             error: None,
+            is_final: false,
             stored,
             missing,
             vsync: None,

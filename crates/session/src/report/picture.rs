@@ -262,16 +262,24 @@ impl Picture {
                             "M{} {y}H{}M{x} {}V{}",
                             short(x - arm), short(x + arm), short(y - arm), short(y + arm)
                         );
+                        // Above the cross and to its right, unless the picture ends there.
+                        @let width = 2.1 * LETTER * arm * marker.label.chars().count() as f64;
+                        @let is_left = x + 0.9 * arm + width > columns as f64;
+                        @let text_x = if is_left { x - 0.9 * arm } else { x + 0.9 * arm };
+                        @let text_y = if y < 2.2 * arm { y + 2.2 * arm } else { y - 0.6 * arm };
                         path.halo d=(cross) {}
                         path d=(cross) stroke=(colour) {}
-                        text x=(short(x + 0.9 * arm)) y=(short(y - 0.6 * arm)) fill=(colour)
-                            font-size=(short(2.1 * arm)) { (marker.label) }
+                        text x=(short(text_x)) y=(short(text_y)) text-anchor=[is_left.then_some("end")]
+                            fill=(colour) font-size=(short(2.1 * arm)) { (marker.label) }
                     }
                 }
             }
         }
     }
 }
+
+/// Width of a wide letter of a cross's label, in its height.
+const LETTER: f64 = 0.75;
 
 /// Side length, in image pixels, of the block that becomes one pixel of a picture with sides of at most
 /// `max_px`.

@@ -128,7 +128,8 @@ impl Plot {
             let root = SVGBackend::with_string(&mut svg, SIZE_PX).into_drawing_area();
             let mut chart = ChartBuilder::on(&root)
                 .margin(8)
-                .margin_right(18)
+                // Half of the longest label, at a tick that lies on the edge.
+                .margin_right(26)
                 .margin_top(if self.guides.is_empty() { 8 } else { 30 })
                 .x_label_area_size(46)
                 .y_label_area_size(62)

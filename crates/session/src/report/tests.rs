@@ -127,6 +127,24 @@ fn a_contact_sheet_shows_what_is_missing_in_its_place() {
 }
 
 #[test]
+fn labels_of_crosses_lie_within_the_picture() {
+    let image = Array2::<f32>::zeros((100, 100));
+    let text = |row, column| {
+        let marker = Marker { label: "4".into(), row, column };
+        let picture = Picture::grey(image.view(), ToneMap { white: 1.0 }).with_markers(vec![marker]);
+        let html = page(vec![Block::Pictures(vec![picture])]);
+        let svg = html.split("class=\"markers\"").nth(1).unwrap();
+        svg.split("<text ").nth(1).unwrap().split("</text>").next().unwrap().to_owned()
+    };
+    let inside = text(50, 50);
+    assert!(inside.starts_with("x=\"53\" y=\"48.8\" fill"), "{inside}");
+    let right = text(50, 99);
+    assert!(right.starts_with("x=\"97\" y=\"48.8\" text-anchor=\"end\""), "{right}");
+    let top = text(0, 50);
+    assert!(top.starts_with("x=\"53\" y=\"6.66\" fill"), "{top}");
+}
+
+#[test]
 fn texts_are_escaped_everywhere() {
     let evil = "<script>alert(\"x\")</script>";
     let picture = Picture::grey(array![[1.0]].view(), ToneMap { white: 1.0 });

@@ -31,7 +31,9 @@ pub(super) fn session(folder: &Path) -> Result<Value, String> {
     let plan = session.read_text(&session.plan_path()).map_err(told)?;
     let is_whole = view["state"] == "complete" && view["stored"] == view["points"];
     let plan = Plan::parse_stored(&plan);
-    view["can_resume"] = json!(!is_whole && plan.is_ok_and(|plan| plan.procedure.past().is_none()));
+    let is_final = session.state().map_err(told)?.end.is_some_and(|end| end.is_final);
+    let may_go_on = !is_whole && !is_final;
+    view["can_resume"] = json!(may_go_on && plan.is_ok_and(|plan| plan.procedure.past().is_none()));
     Ok(view)
 }
 

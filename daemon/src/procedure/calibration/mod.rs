@@ -193,7 +193,9 @@ impl Measurement for CalibrationRun {
         };
         warnings.extend(found.iter().flat_map(BoardFindings::warnings));
         let stored = ledger.state().stored_points();
+        let is_final = matches!(&fault, Some(RunError::Calibration(error)) if error.is_final());
         let end = EndEntry {
+            is_final,
             error: fault.map(|fault| fault.to_string()),
             vsync,
             light_s: exposures.light_s(),

@@ -52,6 +52,7 @@ pub fn check(film: &FilmTask, products: &[ProductSpec], lab: &Lab<'_>) -> Result
         extra_points: task.schedule.points.len() - settings,
         frames: dark_frames + (settings * film.points()) as u64,
         light_s: light_periods as f64 * task.geometry.raster.period_us * 1e-6,
+        white_dn: Some(task.geometry.white_dn),
         reach_rows: Some(model.reach_rows),
         condition: Some(model.condition),
         film: Some(cycles),

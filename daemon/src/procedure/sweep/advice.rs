@@ -162,6 +162,11 @@ mod tests {
         let bright = RIG.replace("[camera]\n", "[camera]\nwhite_dn = 4000\n");
         let error = advised(&bright, "kind = \"sweep\"\n[sweep]\ndelay_us = [0]\n", &camera()).unwrap_err();
         assert!(matches!(error, NoAdvice::NothingUsable), "{error}");
+        // Settings that see the rows beside it alone tell nothing of direct light.
+        let plan = "kind = \"sweep\"\n[sweep]\nexposure_us = [600]\ndelay_us = [-600, 0, 600]\n";
+        let error = advised(&bright, plan, &camera()).unwrap_err();
+        assert!(matches!(error, NoAdvice::NothingUsable), "{error}");
+        assert!(advised(RIG, plan, &camera()).is_ok());
         let plan = "kind = \"sweep\"\n[sweep]\ndelay_us = { start = -8000, stop = 8000, count = 1000 }\n";
         let error = advised(RIG, plan, &camera()).unwrap_err();
         assert!(matches!(error, NoAdvice::TooLarge { points: 5000, .. }), "{error}");

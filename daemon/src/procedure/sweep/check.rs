@@ -65,6 +65,7 @@ pub fn check(sweep: &SweepTask, products: &[ProductSpec], lab: &Lab<'_>) -> Resu
         extra_points: task.schedule.points.len() - points,
         frames: frames().sum(),
         light_s: light_periods as f64 * geometry.raster.period_us * 1e-6,
+        white_dn: Some(geometry.white_dn),
         reach_rows: Some(model.reach_rows),
         condition: Some(model.condition),
         warnings,

@@ -29,6 +29,8 @@ pub struct Finder {
     pixels: Array2<u16>,
     focus: FocusMeter,
     values: ViewfinderValues,
+    /// Those of the newest picture, as they were told with it.
+    told: Option<ViewfinderValues>,
     rhythm: Rhythm,
     ends: Option<Instant>,
 }
@@ -100,6 +102,7 @@ impl Finder {
                 dot: None,
                 problem: None,
             },
+            told: None,
             rhythm: Rhythm { pace: Duration::from_secs_f64(1.0 / plan.pictures_per_s), next: now },
             ends: plan.seconds.map(|seconds| now + Duration::from_secs_f64(seconds)),
         }
@@ -152,12 +155,13 @@ impl Finder {
         self.focus.restart();
     }
 
-    /// Says what keeps the viewfinder from showing more, once.
+    /// Says what keeps the viewfinder from showing more, once. All that is told beside it is of the newest picture.
     pub fn complain(&mut self, problem: impl Into<String>) {
         let problem = Some(problem.into());
         if self.values.problem != problem {
-            self.values.problem = problem;
-            self.board.publish(Event::Viewfinder(Box::new(self.values.clone())));
+            self.values.problem.clone_from(&problem);
+            let told = self.told.as_ref().unwrap_or(&self.values).clone();
+            self.board.publish(Event::Viewfinder(Box::new(ViewfinderValues { problem, ..told })));
         }
     }
 
@@ -227,6 +231,7 @@ impl Finder {
             });
         }
         self.values.sequence = self.publish(self.pixels.view());
+        self.told = Some(self.values.clone());
         self.board.publish(Event::Viewfinder(Box::new(self.values.clone())));
     }
 

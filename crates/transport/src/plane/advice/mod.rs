@@ -21,9 +21,18 @@ pub use search::{Advice, Arrangement, Design, Proposal, Search, SweepGrid, Usabl
 /// a rendered corner of two boards it is 0.0026 per direct light of 1.
 const INDIRECT_PER_ROW: f64 = 0.003;
 
+/// A setting that collects less of its own row's light does not see it.
+const SEEN: f64 = 0.1;
+
 /// The light that a white pixel in the middle of the frame, lit by its surroundings, collects with a setting.
 pub fn white_light(timing: &RowTiming, setting: &Setting) -> f64 {
     let (weights, own_row) = timing.typical_weights(timing.camera_rows() / 2, setting);
     let own = weights[own_row];
     own + INDIRECT_PER_ROW * (weights.iter().sum::<f64>() - own)
+}
+
+/// Whether a pixel in the middle of the frame collects direct light with a setting.
+pub fn sees_own_row(timing: &RowTiming, setting: &Setting) -> bool {
+    let (weights, own_row) = timing.typical_weights(timing.camera_rows() / 2, setting);
+    weights[own_row] > SEEN
 }

@@ -57,6 +57,9 @@ export const number = (value) =>
   !Number.isFinite(value) ? "–" : value === 0 ? "0" : Math.abs(value) >= 1e5 || Math.abs(value) < 1e-3
     ? value.toExponential(2) : String(Number(value.toPrecision(4)));
 
+/** Units of a picture, without what more is said of them. */
+export const unitsOf = ({ about }) => about?.units?.split(";")[0];
+
 /** Makes an element; attributes `on...` are listeners. */
 export const element = (name, attributes = {}, ...children) => {
   const made = document.createElement(name);

@@ -4,7 +4,7 @@ import { by, call, note } from "./main.js";
 import { marksOf, showFinder, startFinder } from "./finder.js";
 import { startDelays } from "./delays.js";
 import { line, plotIn } from "./plots.js";
-import { Picture, element, fetchPicture, number, pairs } from "./picture.js";
+import { Picture, element, fetchPicture, number, pairs, unitsOf } from "./picture.js";
 
 const UNDER_WAY = ["preparing", "armed", "running", "paused", "draining"];
 
@@ -140,7 +140,8 @@ function draw() {
   const rows = [];
   if (progress) {
     const lost = Object.entries(progress.counts.lost).map(([cause, frames]) => `${frames} ${words(cause)}`);
-    rows.push(["stored", `${progress.points_stored} of ${progress.points_planned}`]);
+    // As at the terminal: dark and regular images too, which are no points of a session.
+    rows.push(["measurements", `${progress.points_stored} of ${progress.points_planned}`]);
     if (isUnderWay && point) rows.push(["this point", `frame ${point.frames} of ${point.of}`]);
     if (isUnderWay) rows.push(["time left", clock(progress.left_s ?? NaN)]);
     rows.push(["elapsed", clock(progress.elapsed_s)], ["rate", `${number(progress.frames_per_s)} frames/s`],
@@ -222,6 +223,9 @@ const seen = () => new Promise((done) => {
   look();
 });
 
+/** Whether the first points of a sweep tell nothing of a picture: they may not see what it shows. */
+const isBlank = ({ about, values }) => about.points != null && !about.last && !values.some((value) => value > 0);
+
 /** Shows the newest live picture of the chosen name, as soon as it comes. */
 async function watchPictures({ onregion, onmarks }) {
   let [names, chosen, sequence, shown] = [{}, null, 0, null];
@@ -256,9 +260,18 @@ async function watchPictures({ onregion, onmarks }) {
   tellAbout = () => {
     if (!shown) return;
     const session = nameOf(shown.about.session);
-    const isOld = session !== nameOf(status.session);
+    // Of a daemon that is lost nobody knows.
+    const isOld = Boolean(status.state) && session !== nameOf(status.session);
     picture.element.classList.toggle("old", isOld);
     by("live-about").textContent = (isOld ? "of an earlier run: " : "") + describe(shown);
+  };
+  /** Says in place of a picture why there is none. */
+  const tellNone = (why) => {
+    const none = shown ? "Nothing is estimated yet of what this picture shows: no point so far sees it."
+      : "No live picture yet. A run publishes its first after some points.";
+    picture.element.hidden = !shown || isBlank(shown);
+    by("live-none").textContent = why ?? none;
+    by("live-none").hidden = why === null && !picture.element.hidden;
   };
   const look = async () => {
     const answer = await fetch("live");
@@ -266,9 +279,7 @@ async function watchPictures({ onregion, onmarks }) {
     // A daemon that was started again counts from 1.
     if ((found[chosen] ?? 0) < sequence) sequence = 0;
     tellAbout();
-    by("live-none").hidden = answer.ok && shown !== null;
-    by("live-none").textContent = answer.ok
-      ? "No live picture yet. A run publishes its first after some points." : await answer.text();
+    tellNone(answer.ok ? null : await answer.text());
     if (Object.keys(found).join() === Object.keys(names).join()) return;
     names = found;
     by("live-names").replaceChildren(...Object.keys(names).map((name) =>
@@ -284,8 +295,7 @@ async function watchPictures({ onregion, onmarks }) {
       const newest = chosen && await fetchPicture(address, waiting.signal);
       if (newest && newest.name === chosen) {
         [sequence, shown] = [newest.sequence, newest];
-        picture.element.hidden = false;
-        by("live-none").hidden = true;
+        tellNone(null);
         picture.selects = newest.name === "viewfinder" && status.role === "operator";
         picture.marks = marksOf(newest);
         picture.show(newest);
@@ -301,12 +311,13 @@ async function watchPictures({ onregion, onmarks }) {
   }
 }
 
-function describe({ about, shape }) {
+function describe(picture) {
+  const { about, shape } = picture;
   const parts = [`${shape[1]} × ${shape[0]} px`];
   if (about.points != null) parts.push(`from ${about.points} points`);
   if (about.cycle != null) parts.push(`cycle ${about.cycle}`);
   if (about.batch != null) parts.push(`batch ${about.batch}`);
-  if (about.units) parts.push(about.units.split(";")[0]);
+  if (about.units) parts.push(unitsOf(picture));
   if (about.session) parts.push(nameOf(about.session));
   return parts.join(" · ");
 }

@@ -1,7 +1,7 @@
 // Sessions on disk: a list with thumbnails, one session, and two side by side with their difference.
 
 import { by, call, note } from "./main.js";
-import { Picture, element, fetchPicture, number, pairs } from "./picture.js";
+import { Picture, element, fetchPicture, number, pairs, unitsOf } from "./picture.js";
 import { line, plotIn } from "./plots.js";
 
 const nameOf = (folder) => folder.split("/").pop();
@@ -196,7 +196,7 @@ function pictures({ sides, menu, slider, which, choice }, [first, second], onpix
       product = name;
     }
     for (const [at, { title, picture, range }] of shown.entries()) {
-      views[at].heading.textContent = title;
+      views[at].heading.textContent = [title, unitsOf(picture)].filter(Boolean).join(" · ");
       views[at].range = range;
       views[at].show(picture);
     }
