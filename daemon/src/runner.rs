@@ -299,12 +299,10 @@ impl Runner {
             warnings: foreseen.report.settings_refused.into_iter().collect(),
         };
         let Foreseen { procedure, shape, .. } = foreseen;
-        let thread = thread::Builder::new()
-            .name("run".into())
-            .spawn(move || conduct(procedure, run, shape.points()))
-            .map_err(|error| {
-                RpcError::new(ErrorCode::Internal, format!("cannot start the run's thread: {error}"))
-            })?;
+        let thread =
+            thread::Builder::new().name("run".into()).spawn(move || conduct(procedure, run, shape)).map_err(
+                |error| RpcError::new(ErrorCode::Internal, format!("cannot start the run's thread: {error}")),
+            )?;
         Ok(Begun { session: dir, is_attached, thread })
     }
 

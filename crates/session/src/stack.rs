@@ -137,6 +137,13 @@ pub enum Contents {
     Nothing,
 }
 
+impl Contents {
+    /// Whether they record one moment, to which no later run can add.
+    pub fn is_past(self) -> bool {
+        matches!(self, Self::Film { .. } | Self::Batches { .. } | Self::Axes { .. } | Self::Nothing)
+    }
+}
+
 /// A shape as ledgers have it. Those written before there was `contents` tell it by what is 0.
 #[derive(Serialize, Deserialize)]
 struct StoredShape {

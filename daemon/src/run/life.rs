@@ -134,7 +134,7 @@ pub struct Ended {
 }
 
 /// The run's thread: acquires, makes the results, and reports the end. Errors and panics never leave the daemon stuck.
-pub fn conduct(procedure: Box<dyn Measurement>, mut run: Run, points: usize) {
+pub fn conduct(procedure: Box<dyn Measurement>, mut run: Run, shape: StackShape) {
     let (board, dir) = (run.board.clone(), run.session.dir().to_owned());
     tracing::info!(session = %dir.display(), resumed = run.is_resumed, "run begins");
     let mut warnings = run.warnings.clone();
@@ -145,8 +145,8 @@ pub fn conduct(procedure: Box<dyn Measurement>, mut run: Run, points: usize) {
     };
     let ended = catch_unwind(AssertUnwindSafe(measure))
         .unwrap_or_else(|panic| Err(RunError::Panicked(message_of(&*panic).to_owned())));
-    let ended = ended.unwrap_or_else(|error| failed(&error, points, &dir, warnings));
-    finish(ended, &board, &dir);
+    let ended = ended.unwrap_or_else(|error| failed(&error, shape.points(), &dir, warnings));
+    finish(ended, &board, &dir, shape);
 }
 
 /// The end of a run that could not reach its own, with the warnings from before it began: also recorded in the ledger, so
@@ -188,7 +188,7 @@ fn freed(session: &Session) -> raysweep_session::Result<Ledger> {
 }
 
 /// Reports the end of a run.
-fn finish(Ended { end, found }: Ended, board: &StatusBoard, dir: &Path) {
+fn finish(Ended { end, found }: Ended, board: &StatusBoard, dir: &Path, shape: StackShape) {
     let state = if end.state == EndState::Faulted { RunState::Faulted } else { RunState::Idle };
     if let Some(error) = &end.error {
         tracing::error!(%error, session = %dir.display(), "run faulted");
@@ -203,7 +203,7 @@ fn finish(Ended { end, found }: Ended, board: &StatusBoard, dir: &Path) {
         report: report.exists().then_some(report),
         stored: end.stored,
         missing: end.missing,
-        is_final: end.is_final,
+        is_final: end.is_final || shape.contents.is_past(),
         film: board.status().film,
         warnings: end.warnings,
         found,

@@ -266,7 +266,7 @@ impl Picture {
                         @let width = 2.1 * LETTER * arm * marker.label.chars().count() as f64;
                         @let is_left = x + 0.9 * arm + width > columns as f64;
                         @let text_x = if is_left { x - 0.9 * arm } else { x + 0.9 * arm };
-                        @let text_y = if y < 2.2 * arm { y + 2.2 * arm } else { y - 0.6 * arm };
+                        @let text_y = if y < 2.2 * arm { (y + 2.2 * arm).min(rows as f64) } else { y - 0.6 * arm };
                         path.halo d=(cross) {}
                         path d=(cross) stroke=(colour) {}
                         text x=(short(text_x)) y=(short(text_y)) text-anchor=[is_left.then_some("end")]

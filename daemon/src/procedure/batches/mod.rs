@@ -82,7 +82,6 @@ impl Measurement for BatchesRun {
         let stored = ledger.state().stored_points();
         let end = EndEntry {
             error: fault.map(|fault| fault.to_string()),
-            is_final: true,
             final_s,
             ..EndEntry::new(state, stored, ledger.state().missing_points(), problems)
         };

@@ -66,7 +66,7 @@ impl Measurement for ResponseRun {
         };
         let error = fault.map(|fault| fault.to_string());
         let missing = ledger.state().missing_points();
-        let end = EndEntry { error, is_final: true, ..EndEntry::new(state, stored, missing, warnings) };
+        let end = EndEntry { error, ..EndEntry::new(state, stored, missing, warnings) };
         ledger.append(&Entry::End(end.clone()))?;
         if let Some(findings) = &findings {
             findings.write(&session, ledger.state(), &task, &rig.file)?;

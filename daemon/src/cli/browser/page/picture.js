@@ -58,7 +58,7 @@ export const number = (value) =>
     ? value.toExponential(2) : String(Number(value.toPrecision(4)));
 
 /** Units of a picture, without what more is said of them. */
-export const unitsOf = ({ about }) => about?.units?.split(";")[0];
+export const unitsOf = ({ about }) => (typeof about?.units === "string" ? about.units.split(";")[0] : null);
 
 /** Makes an element; attributes `on...` are listeners. */
 export const element = (name, attributes = {}, ...children) => {

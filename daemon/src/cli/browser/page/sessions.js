@@ -158,7 +158,7 @@ function differences(one, two) {
   const keys = [...new Set(sides.flatMap((side) => [...side.keys()]))]
     .filter((key) => (sides[0].get(key) || "") !== (sides[1].get(key) || ""));
   const row = (kind, cells) => element("tr", {}, ...cells.map((cell) => element(kind, {}, cell || "–")));
-  return element("table", { class: "differences" }, row("th", ["", nameOf(one.session), nameOf(two.session)]),
+  return element("table", { class: "differences" }, row("th", [" ", nameOf(one.session), nameOf(two.session)]),
     ...keys.map((key) => row("td", [key, ...sides.map((side) => side.get(key))])));
 }
 

@@ -289,7 +289,7 @@ impl<'a> Fit<'a> {
 
     /// Joint steps until they are short, at most `limit`.
     fn steps(&mut self, limit: usize, free: bool) -> Result<(), TimesError> {
-        let (mut part, mut last_sds) = (1.0, f64::INFINITY);
+        let (mut part, mut last) = (1.0, None::<(DVector<f64>, f64)>);
         for _ in 0..limit {
             let Normal { matrix, right, frames } = self.normal(free);
             let mut step = matrix.cholesky().ok_or(TimesError::Undetermined)?.solve(&right);
@@ -300,10 +300,12 @@ impl<'a> Fit<'a> {
             let length_sds = right.dot(&step).sqrt();
             let mut coefficients = step.rows_mut(0, self.table.coefficients);
             // Derivatives jump where an edge passes from row to row, and whole steps may lead to and fro across one.
-            if coefficients.amax() < STEP_US && length_sds > last_sds / 2.0 {
+            let is_whole = coefficients.amax() < STEP_US;
+            let turns =
+                |(last, last_sds): &(DVector<f64>, f64)| right.dot(last) < 0.0 && length_sds > last_sds / 2.0;
+            if is_whole && last.as_ref().is_some_and(turns) {
                 part /= 2.0;
             }
-            last_sds = length_sds;
             coefficients.apply(|step| *step = step.clamp(-STEP_US, STEP_US));
             self.unknowns.iter_mut().zip(&step).for_each(|(unknown, step)| *unknown += part * step);
             for FrameNormal { frame, mixed, weight, right } in &frames {
@@ -314,6 +316,7 @@ impl<'a> Fit<'a> {
             if part * length_sds < CONVERGED_SDS {
                 break;
             }
+            last = Some((step, length_sds));
         }
         Ok(())
     }
