@@ -418,8 +418,9 @@ impl Runner {
                 .map_err(|error| no_session(format!("cannot read {}: {}", path.display(), io_text(&error))))
         };
         let plan = read(session.plan_path())?;
+        let state = session.state().map_err(|error| storage(&error))?;
         // Another rig file would not help.
-        if let Some(what) = Plan::parse_stored(&plan).ok().and_then(|plan| plan.procedure.past()) {
+        if let Some(what) = state.session.shape.contents.past() {
             return Err(no_session(format!("{}: {what}", session.dir().display())));
         }
         if !self.rig.is_of(&read(session.rig_path())?) {

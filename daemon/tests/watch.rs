@@ -20,6 +20,7 @@ const RIG: &str = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver
                    [sim]\nscene = \"v-groove\"\nscene_rows = 8\nscene_columns = 8\n";
 const PLAN: &str = "kind = \"sweep\"\nname = \"watched\"\n[sweep]\naverage = 1000\n\
                     delay_us = [-60, 0, 60]\nexposure_us = [50, 100, 150]\n";
+const FILM: &str = "kind = \"film\"\n[film]\ncycles = 1000\ndelay_us = [-60, 0, 60]\nexposure_us = 100\n";
 
 fn folder() -> TempDir {
     let folder = tempfile::tempdir().unwrap();
@@ -28,9 +29,9 @@ fn folder() -> TempDir {
 }
 
 /// A run that is paused.
-fn paused(daemon: &mut Daemon) -> PathBuf {
+fn paused(daemon: &mut Daemon, text: &str) -> PathBuf {
     let mut client = daemon.client();
-    let session = client.run(&plan(PLAN)).unwrap().session;
+    let session = client.run(&plan(text)).unwrap().session;
     wait_for("a run that can be paused", || client.pause().ok());
     wait_for("the pause", || (client.status().unwrap().state == RunState::Paused).then_some(()));
     session
@@ -50,10 +51,10 @@ fn wait_until_said(folder: &Path, words: &str) {
 }
 
 /// A daemon that was killed during a pause while it was watched: its folder, the session and the watcher.
-fn killed_while_watched() -> (TempDir, PathBuf, Process) {
+fn killed_while_watched(text: &str) -> (TempDir, PathBuf, Process) {
     let folder = folder();
     let mut daemon = Daemon::start(folder.path());
-    let session = paused(&mut daemon);
+    let session = paused(&mut daemon, text);
     let watch = watch(folder.path());
     wait_until_said(folder.path(), "paused");
     daemon.kill();
@@ -67,7 +68,7 @@ fn output(folder: &Path) -> String {
 
 #[test]
 fn a_run_is_watched_to_its_end_across_a_restart_of_the_daemon() {
-    let (folder, session, mut watch) = killed_while_watched();
+    let (folder, session, mut watch) = killed_while_watched(PLAN);
     let mut daemon = Daemon::start(folder.path());
     let (_, state) = end(&mut daemon, |client| drop(client.resume(&session).unwrap()));
     assert_eq!(state, "complete");
@@ -78,7 +79,7 @@ fn a_run_is_watched_to_its_end_across_a_restart_of_the_daemon() {
 
 #[test]
 fn a_run_that_nobody_goes_on_with_is_said_to_be_incomplete() {
-    let (folder, session, mut watch) = killed_while_watched();
+    let (folder, session, mut watch) = killed_while_watched(PLAN);
     let _daemon = Daemon::start(folder.path());
     assert_eq!(watch.wait().code(), Some(3));
     let name = session.file_name().unwrap().to_str().unwrap();
@@ -87,8 +88,17 @@ fn a_run_that_nobody_goes_on_with_is_said_to_be_incomplete() {
 }
 
 #[test]
+fn a_film_that_was_cut_off_is_not_said_to_be_resumed() {
+    let (folder, _session, mut watch) = killed_while_watched(FILM);
+    let _daemon = Daemon::start(folder.path());
+    assert_eq!(watch.wait().code(), Some(3));
+    let output = output(folder.path());
+    assert!(output.starts_with("unfinished: ") && !output.contains("resume"), "{output}");
+}
+
+#[test]
 fn ctrl_c_ends_the_wait_for_a_daemon() {
-    let (_folder, _session, mut watch) = killed_while_watched();
+    let (_folder, _session, mut watch) = killed_while_watched(PLAN);
     watch.signal(Signal::SIGINT);
     assert_eq!(watch.wait().code(), Some(0));
 }

@@ -373,6 +373,9 @@ pub struct SessionInfo {
     pub stored: usize,
     /// Sweep points planned.
     pub points: usize,
+    /// Whether `resume` would add to what is stored, or end what did not come to its end.
+    #[serde(default)]
+    pub can_resume: bool,
     /// `complete`, `cancelled` or `faulted`; `unfinished` if no run has ended; `unreadable`.
     pub state: String,
     /// Kind of the plan; empty if it is unreadable.

@@ -31,6 +31,8 @@ pub struct SessionSummary {
     pub points: usize,
     /// Stored points of those planned.
     pub stored: usize,
+    /// See [`State::can_resume`](crate::ledger::State::can_resume).
+    pub can_resume: bool,
     /// How its latest run ended; `None` while one is running and after a crash.
     pub end: Option<EndState>,
     /// Warnings of its latest run.
@@ -65,6 +67,7 @@ pub fn list(root: &Path) -> Result<Listing> {
             Ok(state) => listing.sessions.push(SessionSummary {
                 stored: state.stored_points(),
                 points: state.session.shape.points(),
+                can_resume: state.can_resume(),
                 end: state.end.as_ref().map(|end| end.state),
                 warnings: state.end.map_or_else(Vec::new, |end| end.warnings),
                 name: state.session.name,

@@ -138,9 +138,21 @@ pub enum Contents {
 }
 
 impl Contents {
-    /// Whether they record one moment, to which no later run can add.
-    pub fn is_past(self) -> bool {
-        matches!(self, Self::Film { .. } | Self::Batches { .. } | Self::Axes { .. } | Self::Nothing)
+    /// Why no later run can add to them; `None` if one can.
+    pub fn past(self) -> Option<&'static str> {
+        match self {
+            Self::Film { .. } => Some(
+                "a film cannot be resumed, because it records one moment: `raysweep process` makes the transports of its stored cycles; run the plan again for another film",
+            ),
+            Self::Batches { .. } => Some(
+                "batches cannot be resumed, because they record one moment: `raysweep process` makes the products of the stored ones; run the plan again for more",
+            ),
+            Self::Axes { .. } => Some("a run of kind \"response\" cannot be resumed: run the plan again"),
+            Self::Nothing => {
+                Some("a viewfinder stores nothing, so there is nothing to resume: start another one")
+            }
+            Self::Sweep { .. } | Self::Patterns { .. } | Self::Darks { .. } | Self::Board { .. } => None,
+        }
     }
 }
 

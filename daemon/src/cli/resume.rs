@@ -80,6 +80,7 @@ mod tests {
             created: String::new(),
             stored: 1,
             points: 2,
+            can_resume: false,
             state: state.into(),
             kind: "sweep".into(),
             operator: None,

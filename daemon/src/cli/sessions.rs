@@ -331,6 +331,7 @@ mod tests {
             created: "2026-11-22T23:59:00Z".into(),
             stored: 1,
             points: 2,
+            can_resume: false,
             state: "complete".into(),
             kind: "sweep".into(),
             operator: Some("Ada Lovelace".into()),

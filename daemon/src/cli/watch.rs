@@ -145,9 +145,7 @@ fn over(socket: &Path, session: &Path, printer: Printer) -> Result<Exit, Command
         let stored = format!("{}: {} of {} points stored", info.state, info.stored, info.points);
         let path = format!("session: {}", session.display());
         let then = format!("`raysweep resume {name}` acquires the missing points");
-        // Films and batches record one moment.
-        let is_past = ["film", "batches", "response"].contains(&info.kind.as_str());
-        let lines = if is_complete || is_past { vec![stored, path] } else { vec![stored, path, then] };
+        let lines = if info.can_resume { vec![stored, path, then] } else { vec![stored, path] };
         lines.join("\n")
     })?;
     Ok(if is_complete { Exit::Done } else { Exit::Incomplete })

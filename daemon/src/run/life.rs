@@ -203,7 +203,7 @@ fn finish(Ended { end, found }: Ended, board: &StatusBoard, dir: &Path, shape: S
         report: report.exists().then_some(report),
         stored: end.stored,
         missing: end.missing,
-        is_final: end.is_final || shape.contents.is_past(),
+        is_final: end.is_final || shape.contents.past().is_some(),
         film: board.status().film,
         warnings: end.warnings,
         found,

@@ -198,6 +198,7 @@ pub fn listed() -> SessionInfo {
         created: "2026-01-01T00:00:00Z".into(),
         stored: 75,
         points: 75,
+        can_resume: false,
         state: "complete".into(),
         kind: "sweep".into(),
         operator: Some("Ada".into()),

@@ -169,23 +169,6 @@ impl Procedure {
         };
         kind.name()
     }
-
-    /// Why no session of it can be resumed, on any rig; `None` if sessions of it can.
-    pub fn past(&self) -> Option<&'static str> {
-        match self {
-            Self::Film(_) => Some(
-                "a film cannot be resumed, because it records one moment: `raysweep process` makes the transports of its stored cycles; run the plan again for another film",
-            ),
-            Self::Batches(_) => Some(
-                "batches cannot be resumed, because they record one moment: `raysweep process` makes the products of the stored ones; run the plan again for more",
-            ),
-            Self::Response(_) => Some("a run of kind \"response\" cannot be resumed: run the plan again"),
-            Self::Viewfinder(_) => {
-                Some("a viewfinder stores nothing, so there is nothing to resume: start another one")
-            }
-            Self::Sweep(_) | Self::Patterns(_) | Self::Darks(_) | Self::Calibration(_) => None,
-        }
-    }
 }
 
 impl Plan {
@@ -311,8 +294,9 @@ fn is_same(a: &Value, b: &Value) -> bool {
     let text = |value: &Value| -> String {
         value.clone().decorated("", "").to_string().split_whitespace().collect()
     };
-    match (number(a), number(b)) {
-        (Some(a), Some(b)) => a == b,
+    match (number(a), number(b), a.as_array(), b.as_array()) {
+        (Some(a), Some(b), ..) => a == b,
+        (.., Some(a), Some(b)) => a.len() == b.len() && a.iter().zip(b).all(|(a, b)| is_same(a, b)),
         _ => text(a) == text(b),
     }
 }
@@ -333,6 +317,10 @@ mod tests {
             ("[sweep]\naverage = 3\n", "\n[[sweep.extra]]\ndelay_us = [0]\nexposure_us = [1]\n");
         assert_eq!(with_tables(commented, few).unwrap(), commented.replace("2 # few", "3"));
         assert_eq!(with_tables(commented, "[sweep]\naverage = 2.0\n").unwrap(), commented);
+        let listed = "kind = \"sweep\"\n[sweep]\ndelay_us = [-20, 0, 20] # near\n";
+        assert_eq!(with_tables(listed, "[sweep]\ndelay_us = [-20.0, 0.0, 20.0]\n").unwrap(), listed);
+        let longer = with_tables(listed, "[sweep]\ndelay_us = [-20.0, 0.0, 20.0, 40.0]\n").unwrap();
+        assert!(longer.contains("40.0") && !longer.contains("near"), "{longer}");
         for own in [
             commented,
             "kind = \"sweep\" # why\nsweep.average = 2\n",

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use raysweep_core::{Counts, FilmSummary};
 
-use super::entry::{AxisEntry, EndEntry, Entry, PointEntry, Remark, SessionEntry};
+use super::entry::{AxisEntry, EndEntry, EndState, Entry, PointEntry, Remark, SessionEntry};
 use crate::damage::{Damage, DamagedPart};
 use crate::dots::BatchEntry;
 use crate::film::CycleEntry;
@@ -105,6 +105,13 @@ impl State {
     pub fn missing_points(&self) -> usize {
         // Each stored point is one of those planned, see `check`.
         self.session.shape.points() - self.stored_points()
+    }
+
+    /// Whether `raysweep resume` would add to what is stored, or end what did not come to its end.
+    pub fn can_resume(&self) -> bool {
+        let is_over =
+            |end: &EndEntry| end.is_final || (end.state == EndState::Complete && self.missing_points() == 0);
+        self.session.shape.contents.past().is_none() && !self.end.as_ref().is_some_and(is_over)
     }
 
     /// SHA-256, hexadecimal, of the files that the session's results depend on, by path with `/` separators; empty in

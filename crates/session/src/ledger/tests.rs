@@ -254,6 +254,34 @@ fn a_new_run_reopens_an_ended_session() {
 }
 
 #[test]
+fn what_has_come_to_its_end_or_is_past_is_not_resumed() {
+    let sweep = session().shape.contents;
+    let film = Contents::Film { cycles: 4, settings: 3, exposures: 2 };
+    let board = Contents::Board { images: 2, capped: 1 };
+    let ended = |state| end(state);
+    let refused =
+        Entry::End(EndEntry { is_final: true, ..EndEntry::new(EndState::Faulted, 1, 3, Vec::new()) });
+    let all: Vec<Entry> = (0..4).map(|index| point(index, 0)).collect();
+    for (contents, entries, expected) in [
+        (sweep, vec![], true),
+        (sweep, vec![point(0, 0), ended(EndState::Cancelled)], true),
+        // All is measured, but not made into products.
+        (sweep, [all.clone(), vec![ended(EndState::Faulted)]].concat(), true),
+        (sweep, [all, vec![ended(EndState::Complete)]].concat(), false),
+        (board, vec![ended(EndState::Faulted)], true),
+        (board, vec![refused], false),
+        (film, vec![], false),
+        (film, vec![ended(EndState::Cancelled)], false),
+        (Contents::Nothing, vec![], false),
+    ] {
+        let shape = StackShape { contents, ..session().shape };
+        let first = Entry::Session(SessionEntry { shape, ..session() });
+        let state = State::replay(std::iter::once(&first).chain(&entries)).unwrap();
+        assert_eq!(state.can_resume(), expected, "{contents:?}");
+    }
+}
+
+#[test]
 fn warnings_are_kept_up_to_a_number_and_a_length_and_older_ends_have_none() {
     let kept = |warnings| EndEntry::new(EndState::Complete, 4, 0, warnings).warnings;
     let many = kept((0..130).map(|number| format!("warning {number}")).collect());

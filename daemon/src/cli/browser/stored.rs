@@ -2,7 +2,6 @@
 
 use std::path::Path;
 
-use raysweep_config::Plan;
 use raysweep_session::ledger::PointEntry;
 use raysweep_session::stack::{ArrayName, Contents};
 use raysweep_session::{Session, transport};
@@ -28,12 +27,7 @@ pub(super) fn session(folder: &Path) -> Result<Value, String> {
     let mut view = serde_json::to_value(view).map_err(told)?;
     view["images"] = json!(images);
     view["has_transport"] = json!(session.transport_path().exists());
-    let plan = session.read_text(&session.plan_path()).map_err(told)?;
-    let is_whole = view["state"] == "complete" && view["stored"] == view["points"];
-    let plan = Plan::parse_stored(&plan);
-    let is_final = session.state().map_err(told)?.end.is_some_and(|end| end.is_final);
-    let may_go_on = !is_whole && !is_final;
-    view["can_resume"] = json!(may_go_on && plan.is_ok_and(|plan| plan.procedure.past().is_none()));
+    view["can_resume"] = json!(session.state().map_err(told)?.can_resume());
     Ok(view)
 }
 
