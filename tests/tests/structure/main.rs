@@ -86,25 +86,54 @@ const KNOW_THE_SIMULATOR: [&str; 2] = ["src/rig/", "src/bin/raysweep-sim-camera.
 
 #[test]
 fn only_the_factory_knows_that_devices_may_be_simulated() {
-    let daemon = Path::new(env!("CARGO_MANIFEST_DIR")).join("../daemon");
-    let mut folders = vec![daemon.join("src")];
+    let daemon = project().join("daemon");
     let mut named = 0;
+    for (path, text) in sources(&daemon.join("src")) {
+        if text.contains("raysweep_sim") {
+            let file = path.strip_prefix(&daemon).unwrap().to_str().unwrap();
+            assert!(
+                KNOW_THE_SIMULATOR.iter().any(|known| file.starts_with(known)),
+                "{file} names raysweep_sim"
+            );
+            named += 1;
+        }
+    }
+    assert!(named > 1, "nothing names raysweep_sim: is it called otherwise?");
+}
+
+/// The files of Rust below a folder, with their texts.
+fn sources(folder: &Path) -> Vec<(PathBuf, String)> {
+    let (mut folders, mut found) = (vec![folder.to_owned()], Vec::new());
     while let Some(folder) = folders.pop() {
         for entry in std::fs::read_dir(folder).unwrap() {
             let path = entry.unwrap().path();
             if path.is_dir() {
                 folders.push(path);
-            } else if std::fs::read_to_string(&path).unwrap().contains("raysweep_sim") {
-                let file = path.strip_prefix(&daemon).unwrap().to_str().unwrap();
-                assert!(
-                    KNOW_THE_SIMULATOR.iter().any(|known| file.starts_with(known)),
-                    "{file} names raysweep_sim"
-                );
-                named += 1;
+            } else if path.extension().is_some_and(|extension| extension == "rs") {
+                let text = std::fs::read_to_string(&path).unwrap();
+                found.push((path, text));
             }
         }
     }
-    assert!(named > 1, "nothing names raysweep_sim: is it called otherwise?");
+    found
+}
+
+/// The fences in docs that rustdoc would take for Rust.
+fn examples(text: &str) -> usize {
+    let fences = text.lines().filter_map(|line| {
+        let line = line.trim_start();
+        line.strip_prefix("///").or(line.strip_prefix("//!"))?.trim_start().strip_prefix("```")
+    });
+    fences.step_by(2).filter(|language| !["text", "python", "toml", "json", "sh"].contains(language)).count()
+}
+
+#[test]
+fn docs_have_no_example_that_no_test_runs() {
+    assert_eq!(examples("//! ```text\n//! a\n//! ```\n    /// ```\n    /// b\n    /// ```\n"), 1);
+    for (path, text) in crates().into_values().flat_map(|folder| sources(&folder.join("src"))) {
+        let path = path.display();
+        assert_eq!(examples(&text), 0, "{path}: doc tests are not run; make the example a test");
+    }
 }
 
 #[test]

@@ -18,9 +18,9 @@ check() {
 }
 # Waits until the command succeeds: for up to five minutes, as machines are busy.
 await() {
-    for attempt in $(seq 1200); do
+    for attempt in $(seq 600); do
         ! "$@" || return 0
-        sleep 0.25
+        sleep 0.5 # To look takes as long in software emulation.
     done
     echo "not within five minutes: $*"
     return 1
