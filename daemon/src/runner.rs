@@ -7,7 +7,6 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use raysweep_config::Plan;
 use raysweep_config::plan::with_tables;
 use raysweep_core::{CameraCapabilities, Size, io_text};
 use raysweep_pipeline::message_of;

@@ -369,10 +369,16 @@ impl Acquisition {
         }
     }
 
-    /// Waits for a frame.
+    /// Waits for a frame; where the camera waits for the pipeline, first for a buffer, unless an order ends the run.
     fn receive(&mut self, timeout: Duration) -> Result<Option<Received>, DeviceError> {
         let mut data = match self.pace {
-            Pace::Pipeline => Some(self.pool.take()),
+            Pace::Pipeline => loop {
+                match self.pool.take_within(POLL) {
+                    None if !self.orders.go_on() => return Ok(None),
+                    None => {}
+                    free => break free,
+                }
+            },
             Pace::Devices => self.pool.try_take(),
         };
         let stamp = self.camera.next_frame(data.as_mut().unwrap_or(&mut self.spare), timeout)?;

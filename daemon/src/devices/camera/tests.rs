@@ -257,18 +257,17 @@ fn play(script: Script, frames: u32, cycles: Option<u32>) -> Played {
     play_plan(&plan(), script, frames, cycles, None)
 }
 
-/// Plays a plan, with a pause after the given number of counted frames.
-fn play_plan(
+type Shared<T> = Arc<Mutex<Vec<T>>>;
+
+/// The acquisition of a plan, with the true settings of each frame and the frames at which settings were written.
+fn acquisition(
     plan: &[CameraSettings],
     script: Script,
-    frames: u32,
-    cycles: Option<u32>,
-    pause_after: Option<usize>,
-) -> Played {
-    let told = Arc::new(Mutex::new(Vec::new()));
-    let orders = Arc::new(Orders::default());
+    input: Input<DeviceEvent>,
+    orders: Arc<Orders>,
+) -> (Acquisition, Shared<CameraSettings>, Shared<u64>) {
+    let (told, truth) = (Shared::default(), Shared::default());
     let clock = Clock::simulated();
-    let truth = Arc::new(Mutex::new(Vec::new()));
     let camera = Scripted {
         script,
         clock: clock.register(),
@@ -283,12 +282,24 @@ fn play_plan(
     };
     let drive =
         Drive { clock, pace: Pace::Pipeline, line: TriggerLine::new(PERIOD_NS as f64 * 1e-3, 50.0, plan) };
+    (Acquisition::new(Box::new(camera), drive, input, orders), truth, told)
+}
+
+/// Plays a plan, with a pause after the given number of counted frames.
+fn play_plan(
+    plan: &[CameraSettings],
+    script: Script,
+    frames: u32,
+    cycles: Option<u32>,
+    pause_after: Option<usize>,
+) -> Played {
     let (input, events) = Input::new(64, Policy::Wait);
+    let orders = Arc::new(Orders::default());
+    let (mut acquisition, truth, told) = acquisition(plan, script, input, orders.clone());
     let follower = std::thread::spawn({
         let orders = orders.clone();
         move || follow(&events, frames, pause_after, &orders)
     });
-    let mut acquisition = Acquisition::new(Box::new(camera), drive, input, orders);
     let latency = OnceLock::new();
     let ended = acquisition.work(Work::Probe(plan[0]), &latency);
     assert!(matches!(ended, Ended::Flushed(Ok(()))));
@@ -377,4 +388,18 @@ fn all_late() -> Vec<Script> {
         }
     }
     scripts
+}
+
+#[test]
+fn a_pipeline_that_keeps_all_buffers_does_not_keep_the_end_of_a_run() {
+    let (input, _events) = Input::new(64, Policy::Wait);
+    let orders = Arc::new(Orders::default());
+    let (mut acquisition, ..) = acquisition(&plan(), EXACT, input, orders.clone());
+    let held: Vec<FrameBuf> = std::iter::from_fn(|| acquisition.pool.try_take()).collect();
+    assert_eq!(held.len(), POOL_BUFFERS);
+    std::thread::scope(|scope| {
+        let received = scope.spawn(|| acquisition.receive(POLL));
+        orders.give(Order::Cancel);
+        assert!(matches!(received.join().unwrap(), Ok(None)));
+    });
 }
