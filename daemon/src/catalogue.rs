@@ -57,7 +57,7 @@ pub fn calibrations_in(data: &Path) -> raysweep_session::Result<Vec<CalibrationI
             Ok(None) => {
                 let why = match session.end {
                     None => "its run has not ended",
-                    Some(_) => "its run did not succeed: see its report and ledger",
+                    Some(_) => "its run did not succeed: `raysweep show` of the session says why",
                 };
                 (None, Some(why.into()))
             }

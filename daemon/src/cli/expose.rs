@@ -62,7 +62,8 @@ pub(super) fn expose(socket: &Path, path: &Path, printer: Printer) -> Result<Exi
         let message = "the plan has no exposures to choose: give a plan of kind \"sweep\" or \"film\"";
         return Err(CommandFailure::Exposure(message.into()));
     };
-    let tried = Trial::begin(socket, foreseen.white_dn)?.longest(shortest_us, longest_us, &delays_us)?;
+    let tried =
+        Trial::begin(socket, foreseen.white_dn, printer)?.longest(shortest_us, longest_us, &delays_us)?;
     let limited = limited(&text, tried.exposure_us)?;
     let foreseen = client.check(&limited).map_err(|error| CommandFailure::of_plan(error, path, &limited))?;
     let (plan, average) = averaged(&limited, &foreseen)?;
@@ -206,18 +207,20 @@ struct Trial {
     /// The viewfinder's session.
     session: PathBuf,
     is_over: bool,
+    /// Whether what was tried is told on the way.
+    tells: bool,
 }
 
 impl Trial {
-    fn begin(socket: &Path, white_dn: Option<f64>) -> Result<Self, CommandFailure> {
+    fn begin(socket: &Path, white_dn: Option<f64>, printer: Printer) -> Result<Self, CommandFailure> {
         let mut events = Client::connect(socket)?.subscribe()?;
         let interrupts = Interrupts::of_any_end().map_err(CommandFailure::Signals)?;
         let client = Client::connect(socket)?;
         let plan = RunParams { plan: VIEWFINDER.into(), attached: true, ..RunParams::default() };
         let session = events.client().run(&plan)?.session;
-        let (pictures, settings_us, is_over) = (0, None, false);
+        let (pictures, settings_us, is_over, tells) = (0, None, false, !printer.json && !printer.quiet);
         let mut trial =
-            Self { client, events, interrupts, pictures, white_dn, settings_us, session, is_over };
+            Self { client, events, interrupts, pictures, white_dn, settings_us, session, is_over, tells };
         trial.picture()?;
         Ok(trial)
     }
@@ -292,6 +295,12 @@ impl Trial {
             saturated += values.saturated * pixels;
             let of_board = headroom_of_board(&values, self.white_dn.or(values.white_dn));
             headroom = headroom.min(headroom_of(&values)).min(of_board);
+        }
+        if self.tells {
+            eprintln!(
+                "tried {exposure_us} us at a delay of {delay_us} us: {:.3} % saturated",
+                100.0 * saturated / samples
+            );
         }
         let suits =
             saturated == 0.0 || saturated + CONFIDENCE * (saturated + 1.0).sqrt() <= MAX_SATURATED * samples;

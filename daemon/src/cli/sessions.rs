@@ -205,8 +205,12 @@ impl SessionView {
         rows.extend(self.error.iter().map(|error| ("error", error.clone())));
         rows.extend(self.warnings.iter().map(|warning| ("warning", warning.clone())));
         rows.extend(self.damage.iter().map(|damage| ("DAMAGED", damage.clone())));
-        let Counts { expected, averaged, .. } = self.counts;
-        rows.push(("frames", format!("{averaged} used of {expected}, {}", self.counts.losses())));
+        let Counts { expected, averaged, settling, cancelled, .. } = self.counts;
+        let others =
+            [(settling, "while settings took effect"), (cancelled, "of attempts that were broken off")];
+        let others = others.into_iter().filter(|(frames, _)| *frames > 0);
+        let others: String = others.map(|(frames, why)| format!(", {frames} {why}")).collect();
+        rows.push(("frames", format!("{averaged} used of {expected}{others}, {}", self.counts.losses())));
         rows.extend(self.light_s.map(|light_s| ("light", duration(light_s))));
         let calibration = self.calibration.map(|made| made.strftime("%Y-%m-%d %H:%M UTC").to_string());
         let is_calibrated = ["sweep", "film", "patterns"].contains(&self.kind.as_str());

@@ -409,6 +409,7 @@ impl Ending<'_> {
         }
         lines.extend(
             light_s
+                .filter(|_| stored + missing > 0)
                 .map(|seconds| format!("{seconds:.2} s from the first to the last frame with light{clock}")),
         );
         lines.extend(final_s.map(|seconds| format!("transport on disk {seconds:.2} s after the last frame")));

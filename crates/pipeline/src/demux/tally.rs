@@ -26,6 +26,8 @@ pub struct SweepSummary {
 const CLOSE_SHARE: f64 = 0.02;
 /// Beyond this range of predicted over captured light, the transport does not describe the scene at all.
 const EXPLAINED_SHARE: RangeInclusive<f64> = 0.8..=1.25;
+/// Below this share, the light was gone for a part of the run.
+const DARK_SHARE: f64 = 0.5;
 /// A larger share of saturated pixels causes a warning: highlights are normal, saturated areas are not.
 const SATURATED_SHARE: f64 = 0.01;
 
@@ -116,8 +118,12 @@ impl Regular {
             let share = self.predicted / self.captured;
             figures.push((PREDICTED_SHARE, share));
             if !EXPLAINED_SHARE.contains(&share) {
+                let light = match share < DARK_SHARE {
+                    true => "the projector went out or the lens was capped for a part of the run, or ",
+                    false => "",
+                };
                 warnings.push(format!(
-                    "THE TRANSPORT DOES NOT EXPLAIN WHAT THE CAMERA SAW: IT PREDICTS {:.1} % OF THE LIGHT OF THE REGULAR IMAGE, WHERE {:.0} TO {:.0} % ARE ALLOWED. Do not use it: the delays are wrong (projector.first_row_us, camera.trigger_latency_us), or the row time, white_dn or the dark images, or the scene or the light changed during the run",
+                    "THE TRANSPORT DOES NOT EXPLAIN WHAT THE CAMERA SAW: IT PREDICTS {:.1} % OF THE LIGHT OF THE REGULAR IMAGE, WHERE {:.0} TO {:.0} % ARE ALLOWED. Do not use it: {light}the delays are wrong (projector.first_row_us, camera.trigger_latency_us), or the row time, white_dn or the dark images, or the scene or the light changed during the run",
                     share * 100.0,
                     EXPLAINED_SHARE.start() * 100.0,
                     EXPLAINED_SHARE.end() * 100.0

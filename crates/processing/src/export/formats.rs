@@ -102,7 +102,6 @@ fn export_into(session: &Session, to: &Path, format: ExportFormat) -> Result<usi
         ExportFormat::Mat => Some(MatFile::create(&to.join("products.mat"), session)?),
         _ => None,
     };
-    let mut files = 0;
     for product in &products {
         let exported = match &mut mat {
             Some(mat) => mat.append(session, product)?,
@@ -112,7 +111,6 @@ fn export_into(session: &Session, to: &Path, format: ExportFormat) -> Result<usi
         let axes = axes.join(", ");
         let said = match &exported {
             Some(Exported { file, scale }) => {
-                files += 1;
                 format!("| `{file}` | `[{axes}]` | {units} | {scale} | {about} |")
             }
             None => format!("| `{name}` is not in this format | `[{axes}]` | {units} | | {about} |"),
@@ -124,7 +122,13 @@ fn export_into(session: &Session, to: &Path, format: ExportFormat) -> Result<usi
     }
     let path = to.join("README.md");
     std::fs::write(&path, readme).map_err(not_copied(&path))?;
-    Ok(files + 1)
+    Ok(files_in(to))
+}
+
+/// The number of files in a folder and those below it.
+fn files_in(folder: &Path) -> usize {
+    let below: usize = listed(folder, FileType::is_dir).iter().map(|inner| files_in(inner)).sum();
+    below + listed(folder, FileType::is_file).len()
 }
 
 /// The products of a session, by name.

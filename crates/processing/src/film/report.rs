@@ -116,7 +116,7 @@ pub fn shortcomings(state: &State, transports_missing: usize) -> Vec<String> {
     }
     if transports_missing > 0 {
         texts.push(format!(
-            "{transports_missing} stored cycles have no transport: `raysweep process` makes them"
+            "{transports_missing} stored cycles have no transport, and products and videos leave them out, so that time jumps there: `raysweep process` makes them"
         ));
     }
     texts.extend(film.warnings.iter().cloned());

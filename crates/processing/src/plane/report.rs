@@ -58,8 +58,14 @@ pub(crate) fn settings(state: &State, task: &PlaneTask) -> Block {
         (
             "projector rows",
             format!(
-                "{}; camera row 0 sees projector row {}; each camera row sees {} rows further down than the one before",
-                geometry.raster.rows, geometry.first_row, geometry.row_pitch
+                "{}; camera row 0 sees projector row {}; each camera row sees {} further down than the one before",
+                geometry.raster.rows,
+                geometry.first_row,
+                if geometry.row_pitch == 1.0 {
+                    "one row".to_owned()
+                } else {
+                    format!("{} rows", geometry.row_pitch)
+                }
             ),
         ),
         ("white", white(geometry)),

@@ -330,7 +330,9 @@ fn ask_size(
     let mut fitting = sizes.iter().filter(|(rows, _)| *rows <= most_rows);
     let first = fitting.clone().next().or(sizes.first()).copied();
     let (rows, columns) = first.unwrap_or((720, 1280));
-    let width = questions.whole("width", "Columns of a frame", columns, 1..=MOST_PX)?;
+    let most = |side: fn(&(u32, u32)) -> u32| sizes.iter().map(side).max().unwrap_or(MOST_PX);
+    let (sensor_rows, sensor_columns) = (most(|size| size.0), most(|size| size.1));
+    let width = questions.whole("width", "Columns of a frame", columns, 1..=sensor_columns)?;
     let rows = fitting.find(|(_, columns)| *columns == width).map_or(rows, |(rows, _)| *rows);
     let question = match first.is_some() && rows > most_rows {
         false => "Rows of a frame",
@@ -338,6 +340,7 @@ fn ask_size(
             "Rows of a frame. The camera lists no size with as few rows as the projector draws: crop it to them, or choose another format"
         }
     };
+    let most_rows = most_rows.min(sensor_rows);
     let height = questions.whole("height", question, rows.min(most_rows), 1..=most_rows)?;
     Ok((height as usize, width as usize))
 }
@@ -388,6 +391,11 @@ mod tests {
         assert_eq!(size(mono10, MOST_PX, "width = 1280").unwrap(), (720, 1280), "the rows of that width");
         let refused = size(mono10, 720, "height = 1080").unwrap_err().to_string();
         assert!(refused.contains("height = 1080; allowed: 1 to 720"), "{refused}");
+        let refused = size(mono8, 720, "width = 4000\nheight = 700").unwrap_err().to_string();
+        assert!(
+            refused.contains("width = 4000; allowed: 1 to 640") && refused.contains("1 to 480"),
+            "{refused}"
+        );
         assert_eq!(size("Mono12".parse().unwrap(), 480, "").unwrap(), (480, 1280), "nothing is known of it");
     }
 }

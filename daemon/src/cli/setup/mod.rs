@@ -26,7 +26,7 @@ use super::printer::{Printer, printable};
 /// A first sweep: the paper's settings with few frames each, so that something is seen soon. Fewer settings do not tell
 /// the pixel's own row from the rows beside it, and reach less of the light.
 const FIRST_SWEEP: &str = "\
-# A first look, written by `raysweep setup`: 15 delays, 5 exposures, 2 frames each.
+# A first look, written by `raysweep setup`; `raysweep expose` fits exposures and frames to the scene.
 kind = \"sweep\"
 name = \"first look\"
 

@@ -61,7 +61,7 @@ pub fn photon_transfer(
             what: "groups of pixels below full scale",
             given: groups.len(),
             needed: 2,
-            cure: "take frames of white and of greys that do not saturate",
+            cure: "take frames of white and of greys that do not saturate: close the aperture, or darken the room if its lamps alone fill the pixels",
         });
     }
     fit(&groups)
