@@ -71,7 +71,18 @@ pub fn calibrations_in(data: &Path) -> raysweep_session::Result<Vec<CalibrationI
             problem,
         }
     };
-    Ok(measured.map(info).collect())
+    let mut found: Vec<CalibrationInfo> = measured.map(info).collect();
+    // Runs use it even if the session that measured it is gone.
+    if let Some(header) = in_use.as_ref().filter(|_| !found.iter().any(|info| info.in_use)) {
+        found.push(CalibrationInfo {
+            session: current_in(data),
+            made: header.made.to_string(),
+            camera: header.valid_for.camera.clone(),
+            in_use: true,
+            problem: None,
+        });
+    }
+    Ok(found)
 }
 
 /// What of a session's calibration is damaged, if anything.

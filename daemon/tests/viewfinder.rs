@@ -464,6 +464,15 @@ fn brute_force(rig: &Rig, delay_us: f64, exposure_us: f64) -> (f64, f64) {
 }
 
 #[test]
+fn no_exposure_is_proposed_of_a_scene_that_is_not_seen() {
+    let program = Program::start(&BRIGHT.replace("white_dn = 2800", "white_dn = 1"));
+    program.plan("kind = \"sweep\"\n[sweep]\ndelay_us = [0]\nexposure_us = [100, 1000]\n");
+    let output = program.raysweep(&["expose", "plan.toml"]);
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(!output.status.success() && said.contains("sees hardly any light"), "{said}");
+}
+
+#[test]
 fn the_proposed_exposure_saturates_nothing_and_is_as_good_as_the_best_of_all() {
     let program = Program::start(BRIGHT);
     program.plan("kind = \"sweep\"\nname = \"mine\"\n[sweep]\ndelay_us = [-300, 0, 300]\nexposure_us = [100, 1000, 15000]\n");

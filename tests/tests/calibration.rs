@@ -279,7 +279,16 @@ fn a_cancelled_calibration_leaves_the_one_in_use() {
     assert_eq!(cancelled.state, "cancelled");
     assert!(!cancelled.open().1.end.unwrap().is_final);
     assert!(!cancelled.session.join("calibration.toml").exists());
-    assert_eq!(kept(&current_in(&bench.folder.path().join("sessions"))), kept(&first.session));
+    let current = current_in(&bench.folder.path().join("sessions"));
+    assert_eq!(kept(&current), kept(&first.session));
+    // It stays in use, and is said to, where the session that measured it is gone.
+    let in_use = || {
+        let found = Control::calibrations(&*bench.runner).unwrap().into_iter().filter(|info| info.in_use);
+        found.map(|info| info.session).collect::<Vec<_>>()
+    };
+    assert_eq!(in_use(), std::slice::from_ref(&first.session));
+    std::fs::remove_dir_all(&first.session).unwrap();
+    assert_eq!(in_use(), [current]);
 }
 
 #[test]
@@ -287,6 +296,7 @@ fn a_board_or_light_of_no_use_is_refused_with_the_reason() {
     for (more, expected) in [
         ("[sim.truth]\nwhite_dn = 300\n", "open the aperture"),
         ("[sim.truth]\nwhite_dn = 6000\n", "close the aperture"),
+        ("[sim.truth]\nwhite_dn = 0.2\n", "sees no light of the board"),
     ] {
         let bench = Bench::new(&small(more));
         let ended = bench.run(&quick());

@@ -149,10 +149,7 @@ impl Ledger {
     /// [`Error::InUse`] if another process has it open for appending; otherwise as [`LedgerText::read`] and
     /// [`LedgerText::replay`].
     pub fn open_damaged(path: &Path) -> Result<(Ledger, LedgerText)> {
-        let to_append =
-            OpenOptions::new().read(true).append(true).custom_flags(NEVER_ELSEWHERE.bits()).open(path);
-        let file = to_append.map_err(Error::io("open ledger", path))?;
-        let file = lock(file, path)?;
+        let file = hold(path)?;
         let bytes = read_bytes(&file, path)?;
         let (text, chain) = parse(&bytes, path)?;
         let state = text.replay(path)?;
@@ -305,6 +302,16 @@ fn check_format(line: &[u8], path: &Path) -> Result<()> {
         }
         _ => Ok(()),
     }
+}
+
+/// Opens a ledger for appending, whatever it says; while it is held, no other process does so.
+///
+/// # Errors
+/// [`Error::InUse`] if another process holds it.
+pub(crate) fn hold(path: &Path) -> Result<Flock<File>> {
+    let to_append =
+        OpenOptions::new().read(true).append(true).custom_flags(NEVER_ELSEWHERE.bits()).open(path);
+    lock(to_append.map_err(Error::io("open ledger", path))?, path)
 }
 
 fn lock(file: File, path: &Path) -> Result<Flock<File>> {

@@ -5,8 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use crate::folder::Session;
-use crate::ledger::Ledger;
-use crate::{Error, Result, durable};
+use crate::{Error, Result, durable, ledger};
 
 /// The folder in a data folder to which sessions are moved that are no longer wanted. It is not a session itself, so no
 /// list shows what is in it.
@@ -54,15 +53,15 @@ impl Session {
     /// # Errors
     /// [`Error::InUse`] during a run, [`Error::Io`] if the file system refuses.
     pub fn delete_for_good(self) -> Result<()> {
-        let ledger = self.ledger_path();
-        let _locked = Ledger::open_damaged(&ledger)?;
-        fs::remove_file(&ledger).map_err(Error::io("delete", &ledger))?;
+        let path = self.ledger_path();
+        let _held = ledger::hold(&path)?;
+        fs::remove_file(&path).map_err(Error::io("delete", &path))?;
         fs::remove_dir_all(self.dir()).map_err(Error::io("delete", self.dir()))
     }
 
     fn move_to(&self, dir: &Path, folder: &Path) -> Result<PathBuf> {
-        // No run goes on in a folder that is moved; a damaged ledger is moved too.
-        let _locked = Ledger::open_damaged(&self.ledger_path()).map_err(|error| match error {
+        // No run goes on in a folder that is moved; a ledger that cannot be read is moved too.
+        let _held = ledger::hold(&self.ledger_path()).map_err(|error| match error {
             Error::Io { source, .. } if source.kind() == io::ErrorKind::NotFound => moved(dir)(source),
             error => error,
         })?;
@@ -103,6 +102,18 @@ fn check_trash(trash: &Path) -> Result<()> {
 mod tests {
     use super::*;
     use crate::folder::tests::session;
+
+    #[test]
+    fn a_session_of_which_nothing_can_be_read_goes_to_the_trash() {
+        let data = tempfile::tempdir().unwrap();
+        let (session, ledger) = Session::create(data.path(), session("s"), "plan", "rig").unwrap();
+        assert!(matches!(session.trash(), Err(Error::InUse { .. })));
+        drop(ledger);
+        fs::write(session.ledger_path(), "").unwrap();
+        let trashed = Session::open(&session.trash().unwrap()).unwrap();
+        trashed.delete_for_good().unwrap();
+        assert_eq!(fs::read_dir(data.path().join(TRASH)).unwrap().count(), 0);
+    }
 
     #[test]
     fn who_moves_a_session_second_is_told_that_it_was_moved() {

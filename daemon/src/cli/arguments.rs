@@ -407,7 +407,7 @@ pub struct ViewfinderArguments {
     #[arg(long, value_name = "T0,T1,S0,S1", value_parser = region)]
     pub region: Option<[usize; 4]>,
     /// Exposure of each frame in microseconds [default: 0.9 of the projector's period, or all of it without a trigger]
-    #[arg(long, value_name = "US")]
+    #[arg(long, value_name = "US", value_parser = exposure)]
     pub exposure_us: Option<f64>,
     /// Have the white board put before the camera first, as for aligning
     #[arg(long)]
@@ -446,6 +446,12 @@ fn trigger_parser() -> impl TypedValueParser<Value = FinderTrigger> {
         let named = FinderTrigger::ALL.into_iter().find(|trigger| trigger.name() == name);
         named.unwrap_or_default()
     })
+}
+
+/// An exposure in microseconds.
+fn exposure(text: &str) -> Result<f64, String> {
+    let exposure_us = text.parse().ok().filter(|us: &f64| us.is_finite() && *us > 0.0);
+    exposure_us.ok_or_else(|| "give a number of microseconds above 0, such as 600".into())
 }
 
 fn region(text: &str) -> Result<[usize; 4], String> {

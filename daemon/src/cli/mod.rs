@@ -54,6 +54,7 @@ use self::sessions::SessionView;
 use self::setup::{SetupFiles, setup};
 use self::view::EventView;
 use self::viewfinder::{Wanted, change_or_plan, changed};
+use raysweep_processing::calibration::{CalibrationHeader, current_in};
 use raysweep_processing::{
     Asked, ExportFormat, ExportScope, ProcessError, copy_acquired, export, export_as, process_asked,
 };
@@ -225,8 +226,17 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
                     printer.print(&json!({ "deleted": dir }), |_| format!("{} is deleted", dir.display()))?;
                 }
                 false => {
+                    let data = dir.parent().unwrap_or(&dir);
+                    let in_use = CalibrationHeader::read(&current_in(data)).ok().flatten();
+                    let is_in_use =
+                        in_use.is_some_and(|it| dir.file_name().is_some_and(|name| *name == *it.session));
                     let to = session.trash().map_err(ProcessError::from)?;
-                    let said = format!("moved to {0}; `raysweep restore {0}` brings it back", to.display());
+                    let mut said =
+                        format!("moved to {0}; `raysweep restore {0}` brings it back", to.display());
+                    if is_in_use {
+                        said +=
+                            "\nits calibration stays in use: `raysweep calibration use` chooses another one";
+                    }
                     printer.print(&json!({ "moved_to": to }), |_| said)?;
                 }
             }

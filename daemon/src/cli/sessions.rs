@@ -58,7 +58,9 @@ const KINDS: [&str; 8] =
 const VIEWFINDER: &str = "viewfinder";
 
 fn day(given: &str) -> Result<Date, &'static str> {
-    given.parse().map_err(|_not_a_date| "not a day, such as 2026-11-22")
+    let date = given.parse::<Date>().ok();
+    // The parser would leave a time out without a word.
+    date.filter(|date| date.to_string() == given).ok_or("not a day, such as 2026-11-22")
 }
 
 impl SessionFilter {

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use ndarray::{Array2, Array3, Axis};
+use raysweep_pipeline::SeenLight;
 use raysweep_session::ledger::{FrameStarts, PointEntry, State};
 use raysweep_session::stack::{Stack, crc32};
 use raysweep_transport::plane::PlaneError;
@@ -21,6 +22,11 @@ pub enum CalibrationError {
     /// The board, its light or its pictures.
     #[error(transparent)]
     Images(#[from] ImagesError),
+    /// White is as dark as black.
+    #[error(
+        "the camera sees no light of the board ({0}): take the cap off the lens and see that the projector is on; `raysweep viewfinder --picture white` shows what the camera sees"
+    )]
+    NoLight(SeenLight),
     /// The second board, its light or its pictures.
     #[error("the second board: {0}")]
     SecondBoard(ImagesError),

@@ -2,6 +2,7 @@
 
 use ndarray::{Array2, Array3, Axis};
 use raysweep_core::{PROJECTOR_COLUMNS, Shutter};
+use raysweep_pipeline::SeenLight;
 use raysweep_session::ledger::PointEntry;
 use raysweep_transport::plane::NoiseModel;
 use raysweep_transport::plane::board::Estimate;
@@ -111,6 +112,17 @@ impl BoardPixels {
         let task = images.task;
         let dark = dark(images)?;
         let [black, white] = images.black_and_white(WhichBoard::First)?;
+        let geometry = &task.task.geometry;
+        let mean = |frames: &Array3<f32>| frames.mean_axis(Axis(0)).unwrap_or_default();
+        match SeenLight::between(
+            mean(&white).view(),
+            mean(&black).view(),
+            geometry.white_dn,
+            geometry.saturation_dn,
+        ) {
+            Some(none) if none.is_surely_none() => return Err(CalibrationError::NoLight(none)),
+            _ => {}
+        }
         let found_dn = saturation(images, &dark, &white)?;
         let saturation_dn = found_dn.unwrap_or(f64::INFINITY).min(task.task.geometry.saturation_dn) as f32;
         let dark_dn = dark.image(WHOLE_US);
