@@ -1,5 +1,6 @@
 //! What a data folder holds, as the socket tells it.
 
+use std::ffi::OsStr;
 use std::path::Path;
 
 use raysweep_processing::calibration::{CalibrationHeader, current_in};
@@ -51,7 +52,7 @@ pub fn calibrations_in(data: &Path) -> raysweep_session::Result<Vec<CalibrationI
     let in_use = CalibrationHeader::read(&current_in(data)).ok().flatten();
     let measured = listing.sessions.into_iter().filter(|session| session.kind == CALIBRATION);
     let info = |session: SessionSummary| {
-        let name = session.dir.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let in_use = in_use.as_ref().is_some_and(|in_use| in_use.is_of(&session.dir));
         let (header, problem) = match CalibrationHeader::read(&session.dir) {
             Ok(header @ Some(_)) => (header, None),
             Ok(None) => {
@@ -67,20 +68,25 @@ pub fn calibrations_in(data: &Path) -> raysweep_session::Result<Vec<CalibrationI
             session: session.dir,
             made: header.as_ref().map_or_else(String::new, |header| header.made.to_string()),
             camera: header.map_or_else(String::new, |header| header.valid_for.camera),
-            in_use: in_use.as_ref().is_some_and(|in_use| in_use.session == name),
+            in_use,
             problem,
         }
     };
     let mut found: Vec<CalibrationInfo> = measured.map(info).collect();
-    // Runs use it even if the session that measured it is gone.
+    // Runs use it even if the session that measured it is gone or cannot be read.
     if let Some(header) = in_use.as_ref().filter(|_| !found.iter().any(|info| info.in_use)) {
-        found.push(CalibrationInfo {
-            session: current_in(data),
-            made: header.made.to_string(),
-            camera: header.valid_for.camera.clone(),
-            in_use: true,
-            problem: None,
-        });
+        let name = Some(OsStr::new(&header.session));
+        let at = found.partition_point(|info| info.session.file_name() < name);
+        found.insert(
+            at,
+            CalibrationInfo {
+                session: current_in(data),
+                made: header.made.to_string(),
+                camera: header.valid_for.camera.clone(),
+                in_use: true,
+                problem: None,
+            },
+        );
     }
     Ok(found)
 }

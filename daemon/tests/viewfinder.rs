@@ -305,8 +305,7 @@ fn a_camera_that_runs_freely_needs_neither_an_edge_nor_a_watcher() {
     }
 }
 
-/// Where the mean focus score of pictures at these positions is largest, by a parabola through the best and its
-/// neighbours at some distance.
+/// That of these positions at which the mean focus score of pictures is largest.
 fn sharpest(view: &mut View, lens: LensOf, positions_mm: &[f64]) -> f64 {
     let lenses = view.lenses.clone().unwrap();
     let scores: Vec<f64> = positions_mm

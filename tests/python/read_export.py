@@ -31,10 +31,22 @@ def pictures():
 
 
 def readme(of):
-    text = (folder / of / "README.md").read_text()
+    if of == "zip":
+        archive = zipfile.ZipFile(folder / "zip.zip")
+        name, = (name for name in archive.namelist() if name.endswith("README.md"))
+        text = archive.read(name).decode()
+    else:
+        text = (folder / of / "README.md").read_text()
     rows = [re.split(r" \| ", line.strip("| ")) for line in text.splitlines() if line.startswith("| ")]
     return {row[0].strip("`"): row for row in rows}
 
+
+endings = {"exr": ".exr", "npy": ".npy", "tiff16": ".tiff", "tiff32": ".tiff", "zip": ".npy"}
+for of, ending in endings.items():
+    rows = readme(of)
+    for name, values, described in pictures():
+        _, axes, units, *_ = rows[f"{name}{ending}"]
+        assert axes == f"`[{', '.join(described['axes'])}]`" and units == described["units"], (of, name, axes, units)
 
 found = 0
 for name, values, described in pictures():

@@ -373,7 +373,8 @@ pub struct SessionInfo {
     pub stored: usize,
     /// Sweep points planned.
     pub points: usize,
-    /// Whether `resume` would add to what is stored, or end what did not come to its end.
+    /// Whether `resume` would add to what is stored, or end what did not come to its end, by the ledger alone: damage is
+    /// not looked for. Also true during its run.
     #[serde(default)]
     pub can_resume: bool,
     /// `complete`, `cancelled` or `faulted`; `unfinished` if no run has ended; `unreadable`.
@@ -398,7 +399,8 @@ pub struct SessionInfo {
 /// One entry of `calibrations`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct CalibrationInfo {
-    /// Folder of the session that measured it.
+    /// Folder of the session that measured it; of the calibration in use the data folder's `calibration`, if that session
+    /// is gone or cannot be read.
     pub session: PathBuf,
     /// When it was measured (RFC 3339); empty if it cannot be read.
     pub made: String,

@@ -51,7 +51,7 @@ pub enum Error {
         why: String,
     },
     /// A crash tore the first line of a ledger: the session had not begun.
-    #[error("{} has no whole line: a crash cut the session off before it had begun, and nothing was acquired; move its folder to the trash", path.display())]
+    #[error("{} has no whole line: a crash cut the session off before it had begun, and nothing was acquired; `raysweep trash` takes its folder", path.display())]
     Torn {
         /// The ledger.
         path: PathBuf,

@@ -307,7 +307,7 @@ fn check_format(line: &[u8], path: &Path) -> Result<()> {
 /// Opens a ledger for appending, whatever it says; while it is held, no other process does so.
 ///
 /// # Errors
-/// [`Error::InUse`] if another process holds it.
+/// [`Error::InUse`] if another process holds it, [`Error::Io`] if it cannot be opened.
 pub(crate) fn hold(path: &Path) -> Result<Flock<File>> {
     let to_append =
         OpenOptions::new().read(true).append(true).custom_flags(NEVER_ELSEWHERE.bits()).open(path);

@@ -1,10 +1,10 @@
 //! What cargo builds for the workspace's tests, and running it: several test binaries at once, because most tests wait
 //! for the time of devices.
 
+use std::collections::VecDeque;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitStatus, Stdio};
-use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::thread::{available_parallelism, scope, sleep};
 use std::time::{Duration, Instant};
@@ -96,10 +96,15 @@ pub fn run_tests(binaries: &[Binary], environment: &[(&str, &Path)]) -> Done {
     let _ = std::fs::remove_dir_all(&logs);
     std::fs::create_dir_all(&logs).map_err(|error| format!("{}: {error}", logs.display()))?;
     tests.sort_by_key(|test| (&test.folder, test.name()));
-    let began = Instant::now();
-    let (next, failed) = (AtomicUsize::new(0), Mutex::new(Vec::new()));
-    let work = || {
-        while let Some(test) = tests.get(next.fetch_add(1, Ordering::Relaxed)) {
+    let (began, count) = (Instant::now(), tests.len());
+    let (left, failed) = (Mutex::new(VecDeque::from(tests)), Mutex::new(Vec::new()));
+    let next = |core: usize| {
+        let mut left = left.lock().unwrap_or_else(PoisonError::into_inner);
+        if core.is_multiple_of(2) { left.pop_front() } else { left.pop_back() }
+    };
+    // From both ends: the drivers' tests wait for the time of devices, the last crate's compute.
+    let work = |core| {
+        while let Some(test) = next(core) {
             let began = Instant::now();
             let log = logs.join(test.path.file_name().unwrap_or_default()).with_added_extension("log");
             let verdict = match run_test(test, &log, environment) {
@@ -118,13 +123,14 @@ pub fn run_tests(binaries: &[Binary], environment: &[(&str, &Path)]) -> Done {
     };
     scope(|scope| {
         let cores = available_parallelism().map_or(1, usize::from);
-        (0..cores).for_each(|_| drop(scope.spawn(work)));
+        let work = &work;
+        (0..cores).for_each(|core| drop(scope.spawn(move || work(core))));
     });
     let failed = failed.into_inner().unwrap_or_else(PoisonError::into_inner);
     if !failed.is_empty() {
         return Err(format!("tests failed, see their output above: {}", failed.join(", ")));
     }
-    say(&format!("{} test binaries passed in {:.0} s", tests.len(), began.elapsed().as_secs_f64()))
+    say(&format!("{count} test binaries passed in {:.0} s", began.elapsed().as_secs_f64()))
 }
 
 /// Runs the tests of a binary with what they need of cargo's environment; the rest of it is that of `cargo xtask`.

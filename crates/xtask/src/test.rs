@@ -33,7 +33,7 @@ pub fn test(wanted: Guest) -> Done {
         run(cargo().args(["clippy", "--all-targets"]).args(what).args(["--", "-D", "warnings"]))
     };
     clippy(&["--workspace", "--all-features"])?;
-    // What has features must be clean without them too.
+    // What has features must be clean with the default ones alone, too.
     clippy(&["--package", "raysweep", "--package", "raysweep-drivers"])?;
     let built = binaries::build()?;
     has_space()?;

@@ -239,13 +239,13 @@ impl Trial {
             let mut is_lit = false;
             for &delay_us in delays_us {
                 let values = self.picture_of(over_us, delay_us)?;
-                is_lit |= values.underexposed < 1.0;
+                is_lit |= values.underexposed <= 1.0 - MAX_SATURATED;
                 let headroom = headroom_of(&values);
                 brightest = if headroom < brightest.0 { (headroom, delay_us) } else { brightest };
             }
             if over_us == longest_us && !is_lit {
                 return Err(CommandFailure::Exposure(format!(
-                    "the camera sees hardly any light: in the plan's longest exposure, {longest_us} us, all pixels are underexposed at every delay; take the cap off the lens, see that the projector is on, open the aperture, or raise the gain"
+                    "the camera sees hardly any light: in the plan's longest exposure, {longest_us} us, nearly all pixels are underexposed at every delay; take the cap off the lens, see that the projector is on, open the aperture, or raise the gain"
                 )));
             }
             let (_, delay_us) = brightest;

@@ -220,26 +220,25 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
         Command::Trash { session, for_good } => {
             let session = Session::open(&folder_of(session, &socket)?).map_err(ProcessError::from)?;
             let dir = session.dir().to_owned();
-            match for_good {
+            let whole = fs::canonicalize(&dir).unwrap_or_else(|_| dir.clone());
+            let kept = whole.parent().map(|data| CalibrationHeader::read(&current_in(data)));
+            let stays_in_use = matches!(kept, Some(Ok(Some(kept))) if kept.is_of(&whole));
+            let (mut told, mut said) = match for_good {
                 true => {
                     session.delete_for_good().map_err(ProcessError::from)?;
-                    printer.print(&json!({ "deleted": dir }), |_| format!("{} is deleted", dir.display()))?;
+                    (json!({ "deleted": dir }), format!("{} is deleted", dir.display()))
                 }
                 false => {
-                    let data = dir.parent().unwrap_or(&dir);
-                    let in_use = CalibrationHeader::read(&current_in(data)).ok().flatten();
-                    let is_in_use =
-                        in_use.is_some_and(|it| dir.file_name().is_some_and(|name| *name == *it.session));
                     let to = session.trash().map_err(ProcessError::from)?;
-                    let mut said =
-                        format!("moved to {0}; `raysweep restore {0}` brings it back", to.display());
-                    if is_in_use {
-                        said +=
-                            "\nits calibration stays in use: `raysweep calibration use` chooses another one";
-                    }
-                    printer.print(&json!({ "moved_to": to }), |_| said)?;
+                    let said = format!("moved to {0}; `raysweep restore {0}` brings it back", to.display());
+                    (json!({ "moved_to": to }), said)
                 }
+            };
+            told["stays_in_use"] = json!(stays_in_use);
+            if stays_in_use {
+                said += "\nits calibration stays in use: `raysweep calibration use` chooses another one";
             }
+            printer.print(&told, |_| said)?;
         }
         Command::Restore { session } => {
             let trashed = Session::open(&trashed_folder_of(session, &socket)?);

@@ -59,8 +59,8 @@ const VIEWFINDER: &str = "viewfinder";
 
 fn day(given: &str) -> Result<Date, &'static str> {
     let date = given.parse::<Date>().ok();
-    // The parser would leave a time out without a word.
-    date.filter(|date| date.to_string() == given).ok_or("not a day, such as 2026-11-22")
+    // The parser takes more than days, and would leave a time out without a word.
+    date.filter(|date| date.to_string() == given).ok_or("not a day as in 2026-11-22")
 }
 
 impl SessionFilter {
@@ -208,8 +208,7 @@ impl SessionView {
         rows.extend(self.warnings.iter().map(|warning| ("warning", warning.clone())));
         rows.extend(self.damage.iter().map(|damage| ("DAMAGED", damage.clone())));
         let Counts { expected, averaged, settling, cancelled, .. } = self.counts;
-        let others =
-            [(settling, "while settings took effect"), (cancelled, "of attempts that were broken off")];
+        let others = [(settling, "settling"), (cancelled, "not needed")];
         let others = others.into_iter().filter(|(frames, _)| *frames > 0);
         let others: String = others.map(|(frames, why)| format!(", {frames} {why}")).collect();
         rows.push(("frames", format!("{averaged} used of {expected}{others}, {}", self.counts.losses())));

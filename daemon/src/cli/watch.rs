@@ -139,12 +139,14 @@ fn over(socket: &Path, session: &Path, printer: Printer) -> Result<Exit, Command
             format!("the daemon is back, but {} is not among its sessions", session.display()),
         ))));
     };
-    let is_complete = info.state == "complete";
+    let is_whole = info.stored == info.points;
+    let is_complete = info.state == "complete" && is_whole;
     printer.print(&info, |info| {
         let name = session.file_name().unwrap_or_default().display();
         let stored = format!("{}: {} of {} points stored", info.state, info.stored, info.points);
         let path = format!("session: {}", session.display());
-        let then = format!("`raysweep resume {name}` acquires the missing points");
+        let then = if is_whole { "brings it to its end" } else { "acquires the missing points" };
+        let then = format!("`raysweep resume {name}` {then}");
         let lines = if info.can_resume { vec![stored, path, then] } else { vec![stored, path] };
         lines.join("\n")
     })?;

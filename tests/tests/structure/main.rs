@@ -118,7 +118,7 @@ fn sources(folder: &Path) -> Vec<(PathBuf, String)> {
     found
 }
 
-/// The fences in docs that rustdoc would take for Rust.
+/// The fences of backticks in docs that rustdoc would take for Rust.
 fn examples(text: &str) -> usize {
     let fences = text.lines().filter_map(|line| {
         let line = line.trim_start();

@@ -26,7 +26,7 @@ pub struct SweepSummary {
 const CLOSE_SHARE: f64 = 0.02;
 /// Beyond this range of predicted over captured light, the transport does not describe the scene at all.
 const EXPLAINED_SHARE: RangeInclusive<f64> = 0.8..=1.25;
-/// Below this share, the light was gone for a part of the run.
+/// Below this share, the light may have been gone for a part of the run.
 const DARK_SHARE: f64 = 0.5;
 /// A larger share of saturated pixels causes a warning: highlights are normal, saturated areas are not.
 const SATURATED_SHARE: f64 = 0.01;

@@ -210,6 +210,11 @@ impl CalibratedAmbient {
 }
 
 impl CalibrationHeader {
+    /// Whether this session measured it.
+    pub fn is_of(&self, session: &Path) -> bool {
+        session.file_name().is_some_and(|name| *name == *self.session)
+    }
+
     /// Reads the header alone; `None` if the folder has none.
     ///
     /// # Errors

@@ -22,9 +22,9 @@ pub enum CalibrationError {
     /// The board, its light or its pictures.
     #[error(transparent)]
     Images(#[from] ImagesError),
-    /// White is as dark as black.
+    /// White is hardly brighter than black.
     #[error(
-        "the camera sees no light of the board ({0}): take the cap off the lens and see that the projector is on; `raysweep viewfinder --picture white` shows what the camera sees"
+        "the camera sees no light of the board ({0}): take the cap off the lens, see that the projector is on, and open the aperture; `raysweep viewfinder --picture white` shows what the camera sees"
     )]
     NoLight(SeenLight),
     /// The second board, its light or its pictures.

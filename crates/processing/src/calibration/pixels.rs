@@ -124,7 +124,7 @@ impl BoardPixels {
             _ => {}
         }
         let found_dn = saturation(images, &dark, &white)?;
-        let saturation_dn = found_dn.unwrap_or(f64::INFINITY).min(task.task.geometry.saturation_dn) as f32;
+        let saturation_dn = found_dn.unwrap_or(f64::INFINITY).min(geometry.saturation_dn) as f32;
         let dark_dn = dark.image(WHOLE_US);
         let greys: Vec<(f64, Array3<f32>)> = CalibrationTask::greys()
             .map(|(light, purpose)| Ok((light, images.frames(purpose)?)))

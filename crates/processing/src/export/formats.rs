@@ -125,6 +125,21 @@ fn export_into(session: &Session, to: &Path, format: ExportFormat) -> Result<usi
     Ok(files_in(to))
 }
 
+/// A README of the axes and units of a session's own arrays, for a copy of them. What cannot be read is left out, if it is
+/// accepted that results are damaged.
+pub(super) fn readme_of_copy(session: &Session, accept_damage: bool) -> Result<String, ProcessError> {
+    let products = match described(session) {
+        Err(_) if accept_damage => Vec::new(),
+        products => products?,
+    };
+    let mut readme = beginning(session, ExportFormat::Zip);
+    for Described { name, axes, units, about, .. } in products {
+        let row = format!("| `{name}.npy` | `[{}]` | {units} | 1 | {about} |", axes.join(", "));
+        let _ = writeln!(readme, "{}", row.replace('\n', " "));
+    }
+    Ok(readme)
+}
+
 /// The number of files in a folder and those below it.
 fn files_in(folder: &Path) -> usize {
     let below: usize = listed(folder, FileType::is_dir).iter().map(|inner| files_in(inner)).sum();
@@ -172,12 +187,15 @@ fn beginning(session: &Session, format: ExportFormat) -> String {
             "TIFF with 16 bits a sample, linear: value = code * scale. Values below 0 and values that are not numbers have code 0."
         }
         ExportFormat::Tiff32 => "TIFF with float32 samples, linear, in the units below.",
-        ExportFormat::Mat | ExportFormat::Zip => {
+        ExportFormat::Mat => {
             "Arrays of type single in `products.mat` (Level 5), in the units below, with axes in this order."
+        }
+        ExportFormat::Zip => {
+            "The session's own files. Of each NumPy array, the `.json` file beside it has all that is known of it."
         }
     };
     format!(
-        "# {name}\n\n{what} t is the camera row, top row first, s the camera column. The session's own files have more: masks, settings, the ledger.\n\n| file | axes | units | scale | content |\n| --- | --- | --- | --- | --- |\n"
+        "# {name}\n\n{what} t is the camera row, top row first, s the camera column. The session has more: masks, settings, the ledger.\n\n| file | axes | units | scale | content |\n| --- | --- | --- | --- | --- |\n"
     )
 }
 

@@ -46,7 +46,10 @@ pub fn export(dir: &Path, to: &Path, accept_damage: bool, scope: ExportScope) ->
             std::fs::create_dir_all(folder).map_err(not_copied(folder))?;
             copy(&session, file, &target)?;
         }
-        let mut copied = files.len();
+        let readme = to.join("README.md");
+        std::fs::write(&readme, formats::readme_of_copy(&session, accept_damage)?)
+            .map_err(not_copied(&readme))?;
+        let mut copied = files.len() + 1;
         if scope == ExportScope::ResultsAndArrays {
             let is_array = |path: &&PathBuf| path.extension().is_some_and(|ending| ending == "zarr");
             for array in listed(dir, FileType::is_dir).iter().filter(is_array) {

@@ -107,7 +107,8 @@ impl State {
         self.session.shape.points() - self.stored_points()
     }
 
-    /// Whether `raysweep resume` would add to what is stored, or end what did not come to its end.
+    /// Whether `raysweep resume` would add to what is stored, or end what did not come to its end, by the ledger alone:
+    /// damage is not looked for. Also true during its run.
     pub fn can_resume(&self) -> bool {
         let is_over =
             |end: &EndEntry| end.is_final || (end.state == EndState::Complete && self.missing_points() == 0);

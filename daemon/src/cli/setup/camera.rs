@@ -330,9 +330,8 @@ fn ask_size(
     let mut fitting = sizes.iter().filter(|(rows, _)| *rows <= most_rows);
     let first = fitting.clone().next().or(sizes.first()).copied();
     let (rows, columns) = first.unwrap_or((720, 1280));
-    let most = |side: fn(&(u32, u32)) -> u32| sizes.iter().map(side).max().unwrap_or(MOST_PX);
-    let (sensor_rows, sensor_columns) = (most(|size| size.0), most(|size| size.1));
-    let width = questions.whole("width", "Columns of a frame", columns, 1..=sensor_columns)?;
+    let most_columns = sizes.iter().map(|(_, columns)| *columns).max().unwrap_or(MOST_PX);
+    let width = questions.whole("width", "Columns of a frame", columns, 1..=most_columns)?;
     let rows = fitting.find(|(_, columns)| *columns == width).map_or(rows, |(rows, _)| *rows);
     let question = match first.is_some() && rows > most_rows {
         false => "Rows of a frame",
@@ -340,7 +339,8 @@ fn ask_size(
             "Rows of a frame. The camera lists no size with as few rows as the projector draws: crop it to them, or choose another format"
         }
     };
-    let most_rows = most_rows.min(sensor_rows);
+    let of_width = sizes.iter().filter(|(_, columns)| *columns >= width).map(|(rows, _)| *rows);
+    let most_rows = most_rows.min(of_width.max().unwrap_or(MOST_PX));
     let height = questions.whole("height", question, rows.min(most_rows), 1..=most_rows)?;
     Ok((height as usize, width as usize))
 }

@@ -397,9 +397,9 @@ fn a_pipeline_that_keeps_all_buffers_does_not_keep_the_end_of_a_run() {
     let (mut acquisition, ..) = acquisition(&plan(), EXACT, input, orders.clone());
     let held: Vec<FrameBuf> = std::iter::from_fn(|| acquisition.pool.try_take()).collect();
     assert_eq!(held.len(), POOL_BUFFERS);
-    std::thread::scope(|scope| {
-        let received = scope.spawn(|| acquisition.receive(POLL));
-        orders.give(Order::Cancel);
-        assert!(matches!(received.join().unwrap(), Ok(None)));
-    });
+    let (told, ended) = std::sync::mpsc::channel();
+    std::thread::spawn(move || told.send(matches!(acquisition.receive(POLL), Ok(None))));
+    assert!(ended.recv_timeout(3 * POLL).is_err(), "it waits");
+    orders.give(Order::Cancel);
+    assert_eq!(ended.recv_timeout(600 * POLL), Ok(true));
 }

@@ -162,7 +162,7 @@ impl<'a> Guest<'a> {
             std::thread::sleep(Duration::from_millis(20));
         }
         // At a random moment of what is left of the run.
-        std::thread::sleep(Duration::from_millis(seed() % 2000));
+        std::thread::sleep(Duration::from_millis(seed() % 1000));
         drop(machine);
         println!("  cut: power cut in mid-run");
         Ok(())
