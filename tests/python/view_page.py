@@ -50,6 +50,8 @@ def fits(page, name):
 
 def run(page, plan):
     """Starts a plan and waits for its end; returns the session's name."""
+    # A page that has just been opened does not yet name the run before.
+    expect(page.locator("#state")).to_have_text("idle")
     before = page.locator("#run-name").text_content()
     page.fill("#plan", plan)
     page.click("#start")

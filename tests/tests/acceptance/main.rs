@@ -144,7 +144,7 @@ fn found_and_known<const N: usize>(
 
 #[test]
 fn an_unknown_rig_sees_the_corner_like_a_known_one() {
-    let rig = calibrated(&raysweep_tests::data("p2r_corner.npz"), &UNKNOWN.replace("JITTER", "5.0"));
+    let rig = calibrated(&raysweep_tests::data("p2r_corner_half.npz"), &UNKNOWN.replace("JITTER", "5.0"));
     let [(calibrated, known)] =
         found_and_known(&rig, |bench, sim| [error_of_sweep(&sweep(bench, SWEEP), sim)]);
     println!("error of T: {calibrated:.4} calibrated, {known:.4} known");
@@ -155,7 +155,7 @@ fn an_unknown_rig_sees_the_corner_like_a_known_one() {
 /// board.
 #[test]
 fn a_flying_spot_is_found_by_the_calibration() {
-    let scene = raysweep_tests::data("p2r_corner.npz");
+    let scene = raysweep_tests::data("p2r_corner_half.npz");
     for (spot, rows) in [("one-way", Scanning::OneWay), ("bidirectional", Scanning::Bidirectional)] {
         let unknown = UNKNOWN.replace("JITTER", "0.5");
         let unknown = unknown.replace("[sim.projector]\n", &format!("[sim.projector]\nspot = \"{spot}\"\n"));
@@ -186,7 +186,7 @@ fn a_flying_spot_is_found_by_the_calibration() {
 /// The first board spreads all of its light over some rows, the second none.
 #[test]
 fn a_second_board_tells_the_beam_from_the_board() {
-    let scene = raysweep_tests::data("p2r_corner.npz");
+    let scene = raysweep_tests::data("p2r_corner_half.npz");
     for scatter_rows in [0.3, 0.7] {
         let board = format!("[sim.board]\nscatter_rows = {scatter_rows}\nscatter_share = 1.0\n");
         let unknown = UNKNOWN.replace("JITTER", "0.5") + &board;
