@@ -26,8 +26,8 @@ pub fn test(wanted: Guest) -> Done {
     has_networks()?;
     has_space()?;
     packages::install()?;
-    // Packages that read our files in practice.
-    let python = python::environment("python", "requirements.txt")?;
+    // Packages that read our files in practice; they are downloaded while we compile.
+    let python = std::thread::spawn(|| python::environment("python", "requirements.txt"));
     run(cargo().args(["fmt", "--all", "--check"]))?;
     let clippy = |what: &[&str]| {
         run(cargo().args(["clippy", "--all-targets"]).args(what).args(["--", "-D", "warnings"]))
@@ -36,6 +36,8 @@ pub fn test(wanted: Guest) -> Done {
     // What has features must be clean with the default ones alone, too.
     clippy(&["--package", "raysweep", "--package", "raysweep-drivers"])?;
     let built = binaries::build()?;
+    let python =
+        python.join().unwrap_or_else(|_| Err("the Python environment's thread panicked".to_owned()))?;
     has_space()?;
     // All failures at once: the next look at them is far away.
     let parts = std::thread::scope(|scope| {

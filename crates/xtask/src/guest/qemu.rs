@@ -61,9 +61,7 @@ impl Machine {
     pub fn command(kernel: &GuestKernel, run: &Path, kernel_arguments: &str) -> Done<Command> {
         let log = run.join("qemu.log");
         let log = std::fs::File::create(&log).map_err(|error| format!("{}: {error}", log.display()))?;
-        // Tests on this machine, some of them in real time, go first.
-        let mut qemu = Command::new("nice");
-        qemu.args(["-n", "10", "qemu-system-x86_64"]);
+        let mut qemu = Command::new("qemu-system-x86_64");
         // Paths of sockets are limited to 108 bytes and target folders may be longer, so all paths are relative.
         qemu.current_dir(run).stdin(Stdio::null()).stdout(Stdio::null()).stderr(log);
         qemu.args(["-machine", "pc", "-cpu", "max", "-m", "1024"]);
