@@ -6,10 +6,13 @@
 mod process;
 mod wire_rig;
 
-use std::fs;
+use std::fs::{self, Permissions};
+use std::os::unix::fs::PermissionsExt;
+use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
+use nix::unistd::Uid;
 use process::{Process, wait_for};
 use raysweep::doctor;
 use raysweep::rig::AnyRig;
@@ -267,6 +270,36 @@ fn a_triggerbox_is_watched_and_a_port_that_another_program_has_open_is_named() {
     let vsync = check(&busy, "vsync");
     assert_eq!(vsync.grade, Grade::Failure, "{busy:#?}");
     assert!(vsync.remedy.as_ref().unwrap().contains("fuser"), "{vsync:?}");
+}
+
+/// Somebody else than the daemon's user, of no group that matters.
+#[test]
+fn a_port_that_the_user_may_not_open_is_named_with_what_permits_it() {
+    const NOBODY: u32 = 65534;
+    assert!(Uid::effective().is_root(), "only root can be somebody else");
+    let link = SerialLink::VirtualCom;
+    let pty = TriggerBoxPty::plug(16_666_667, link, WireFaults::default()).unwrap();
+    fs::set_permissions(pty.path(), Permissions::from_mode(0o600)).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    fs::set_permissions(folder.path(), Permissions::from_mode(0o755)).unwrap();
+    let (rig, data) = (folder.path().join("rig.toml"), folder.path().join("data"));
+    fs::write(&rig, triggerbox_rig(pty.path())).unwrap();
+    fs::create_dir(&data).unwrap();
+    std::os::unix::fs::chown(&data, Some(NOBODY), Some(NOBODY)).unwrap();
+    // Others may not enter the folder in which it was built, such as root's home.
+    let program = folder.path().join("raysweep");
+    fs::copy(env!("CARGO_BIN_EXE_raysweep"), &program).unwrap();
+    let mut command = Command::new(&program);
+    command.args(["--json", "doctor", "--rig"]).arg(&rig).arg("--data").arg(&data);
+    let output = command.uid(NOBODY).gid(NOBODY).output().unwrap();
+    let error = String::from_utf8_lossy(&output.stderr);
+    let report: DoctorReport = serde_json::from_slice(&output.stdout).expect(&error);
+    assert_eq!((output.status.code(), report.user.as_str()), (Some(1), "nobody"), "{report:#?}");
+    assert_wrong(&report, &[("vsync.triggerbox.port", Grade::Failure), ("vsync", Grade::Failure)]);
+    let port = check(&report, "vsync.triggerbox.port");
+    assert!(port.found.contains("nobody may not use it"), "{port:?}");
+    // Its group may not use it either, so to be in the group would not help.
+    assert!(port.remedy.as_ref().unwrap().contains("chmod g+rw"), "{port:?}");
 }
 
 #[test]

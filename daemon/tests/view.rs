@@ -31,6 +31,13 @@ const RIG: &str = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver
 const SWEEP: &str = "kind = \"sweep\"\nname = \"groove\"\n[sweep]\naverage = 4\n\
                      delay_us = { start = -900, stop = 900, count = 13 }\nexposure_us = [400, 800]\n";
 const FILM: &str = "kind = \"film\"\nname = \"film\"\n[film]\ncycles = 12\n";
+const DOTS: &str = "kind = \"dots\"\n[camera]\ndriver = \"sim\"\n[mirror]\ndriver = \"sim\"\n\
+                    [sim.dots]\nscene = \"v-groove\"\nrows = 112\ncolumns = 128\nmargin_rows = 16\nseed = 5\n";
+const BATCHES: &str = "kind = \"batches\"\nname = \"dots\"\nproduct = [{ kind = \"floodlit\" }]\n\
+                       [batches]\ncount = 2\ndots = 300\nexposure_us = 100\ndark_frames = 64\n\
+                       trailing_region = [112, 128, 48, 80]\nbackground_indices = [0]\ncalibration = []\n\
+                       [batches.path]\nshape = \"lissajous\"\ncycles = [7, 1]\namplitude_deg = [2.3, 1.3]\n\
+                       samples = 1500\nrate_hz = 30000\n";
 /// Nobody: a user who is no operator.
 const OBSERVER: u32 = 65534;
 
@@ -289,15 +296,12 @@ fn sequence(picture: &[u8]) -> u64 {
     head["sequence"].as_u64().unwrap()
 }
 
-/// In virtual time, so that no frame is lost on a busy machine. What browsers cost in real time is measured by
-/// `cargo xtask bench view`.
-#[test]
-fn ten_browsers_change_no_bit_of_a_sweep_and_a_film() {
+/// A film and a sweep. The sweep comes last because it leaves all pictures that browsers look at.
+const WATCHED: [&str; 2] = [FILM, SWEEP];
+
+/// Runs [`WATCHED`] while ten browsers look at all that they can, and have looked at what the runs before have left.
+fn run_watched(lab: &Lab) -> [PathBuf; 2] {
     const BROWSERS: usize = 10;
-    let lab = Lab::start();
-    // The sweep comes last because it leaves all pictures that the browsers look at.
-    let plans = [FILM, SWEEP];
-    let alone = plans.map(|plan| lab.run(plan));
     let page = Arc::new(lab.view(None));
     let (stop, pictures) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicUsize::new(0)));
     // The stream of events stays open, as a browser's does.
@@ -334,7 +338,7 @@ fn ten_browsers_change_no_bit_of_a_sweep_and_a_film() {
     };
     // Each looks on when the runs begin: it has seen the only picture that there is for it.
     seen(BROWSERS);
-    let watched = plans.map(|plan| lab.run(plan));
+    let watched = WATCHED.map(|plan| lab.run(plan));
     seen(2 * BROWSERS);
     stop.store(true, Ordering::Relaxed);
     browsers.into_iter().for_each(|browser| browser.join().unwrap());
@@ -349,9 +353,30 @@ fn ten_browsers_change_no_bit_of_a_sweep_and_a_film() {
             text.clear();
         }
     }
+    watched
+}
+
+/// In virtual time, in which a busy machine is no other.
+#[test]
+fn ten_browsers_change_no_bit_of_a_sweep_and_a_film() {
+    let lab = Lab::start();
+    let alone = WATCHED.map(|plan| lab.run(plan));
+    let watched = run_watched(&lab);
     for ((alone, watched), array) in alone.iter().zip(&watched).zip(["film.zarr", "stack.zarr"]) {
         let (alone, watched) = (files(&alone.join(array)), files(&watched.join(array)));
         assert!(alone.len() > 2 && alone == watched, "{array} differs");
+    }
+}
+
+/// The frames come when the camera of a rig would send them. What browsers take of a core is measured by
+/// `cargo xtask bench view`.
+#[test]
+fn ten_browsers_cost_no_frame_in_real_time() {
+    let lab = Lab::with(&format!("{RIG}realtime = true\n"));
+    lab.run(SWEEP);
+    for session in run_watched(&lab) {
+        let counts = Session::open(&session).unwrap().state().unwrap().counts;
+        assert!(counts.balanced() && counts.averaged > 100 && counts.lost.is_empty(), "{counts:?}");
     }
 }
 
@@ -436,7 +461,8 @@ fn a_session_in_the_trash_is_said_to_be_there_and_is_not_resumed() {
 }
 
 /// A run is checked, started, watched, paused, cancelled, resumed, finished; its report is opened; a viewfinder is worked;
-/// two sessions are compared; a run's questions are answered; a session's warnings are read.
+/// two sessions are compared; a run's questions are answered; a session's warnings are read; colours, limits and zoom of
+/// a picture are changed; a dot rig's batches are watched.
 #[test]
 fn the_page_works_in_a_real_browser() {
     let python = std::env::var("RAYSWEEP_PYTHON").expect(
@@ -449,6 +475,8 @@ fn the_page_works_in_a_real_browser() {
     ledger.append(&Entry::End(end)).unwrap();
     drop(ledger);
     let page = lab.view(None);
+    let dots = Lab::with(DOTS);
+    let of_dots = dots.view(None);
     let rig = RIG.replace("[projector]\ndriver = \"sim\"", "[projector]\ndriver = \"external\"");
     assert_ne!(rig, RIG);
     let asking = Lab::with(&format!("{rig}realtime = true\n"));
@@ -456,6 +484,7 @@ fn the_page_works_in_a_real_browser() {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/python/view_page.py");
     let mut command = Command::new(python);
     command.arg(script).arg(&page.address).arg(lab.write_plan(SWEEP)).arg(&asked.address);
+    command.arg(&of_dots.address).arg(dots.write_plan(BATCHES));
     // To look at them: RAYSWEEP_SCREENSHOTS=FOLDER.
     if let Some(folder) = std::env::var_os("RAYSWEEP_SCREENSHOTS") {
         command.arg(folder);

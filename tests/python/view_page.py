@@ -1,4 +1,5 @@
-"""The page of `raysweep view` in Chromium: view_page.py ADDRESS PLAN ADDRESS_OF_A_RIG_THAT_ASKS [FOLDER FOR SCREENSHOTS]"""
+"""The page of `raysweep view` in Chromium:
+view_page.py ADDRESS PLAN ADDRESS_OF_A_RIG_THAT_ASKS ADDRESS_OF_A_DOT_RIG PLAN_OF_BATCHES [FOLDER FOR SCREENSHOTS]"""
 
 import shutil
 import sys
@@ -7,7 +8,8 @@ from pathlib import Path
 from playwright.sync_api import expect, sync_playwright
 
 address, plan, asking = sys.argv[1], Path(sys.argv[2]).read_text(), sys.argv[3]
-screenshots = Path(sys.argv[4]) if len(sys.argv) > 4 else None
+dots, batches = sys.argv[4], Path(sys.argv[5]).read_text()
+screenshots = Path(sys.argv[6]) if len(sys.argv) > 6 else None
 # A busy machine may take its time.
 PATIENCE_MS = 120_000
 expect.set_options(timeout=PATIENCE_MS)
@@ -98,6 +100,79 @@ def first_visit(page):
         page.get_by_role("link", name="Open the report").click()
     expect(opened.value.locator("h1")).to_contain_text("groove")
     opened.value.close()
+    tools(page)
+
+
+def tools(page):
+    """Changes colours, limits and zoom of the live picture."""
+    live = page.locator("#live-picture")
+    canvas = live.locator("canvas.image")
+    # Whether any pixel is of a colour, and the brightest red.
+    look = """canvas => {
+        const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d", { willReadFrequently: true });
+        copy.drawImage(canvas, 0, 0);
+        const { data } = copy.getImageData(0, 0, canvas.width, canvas.height);
+        let [isColoured, brightest] = [false, 0];
+        for (let at = 0; at < data.length; at += 4) {
+            isColoured ||= data[at] !== data[at + 2];
+            brightest = Math.max(brightest, data[at]);
+        }
+        return [isColoured, brightest];
+    }"""
+    assert canvas.evaluate(look) == [False, 255], canvas.evaluate(look)
+    live.get_by_label("Colours").select_option("viridis")
+    assert canvas.evaluate(look)[0]
+    live.get_by_label("Colours").select_option("grey")
+    # Ten times as much as the brightest pixels is their white.
+    upper = live.get_by_label("Upper limit")
+    limit = 10 * float(upper.input_value())
+    upper.fill(str(limit))
+    upper.press("Enter")
+    expect(live.get_by_label("automatic limits")).not_to_be_checked()
+    is_coloured, brightest = canvas.evaluate(look)
+    assert not is_coloured and brightest < 64, brightest
+    live.get_by_label("automatic limits").check()
+    assert canvas.evaluate(look)[1] == 255
+    # The pixel under the cursor stays there while it grows, and its neighbours move away.
+    canvas.scroll_into_view_if_needed()
+    box = canvas.bounding_box()
+    corner = (box["x"] + 8, box["y"] + 8)
+    page.mouse.move(*corner)
+    expect(live.locator(".readout")).to_contain_text("row 0, column 0:")
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    for _ in range(8):
+        page.mouse.wheel(0, -100)
+    page.mouse.move(*corner)
+    expect(live.locator(".readout")).to_contain_text("row 20, column 13:")
+    shot(page, "zoom")
+    live.get_by_role("button", name="Whole picture").click()
+    page.mouse.move(*corner)
+    expect(live.locator(".readout")).to_contain_text("row 0, column 0:")
+
+
+def dot_rig(page):
+    """Watches the batches of a dot rig."""
+    page.goto(dots)
+    run(page, batches)
+    expect(page.locator("#live-names button")).to_have_text(["floodlit"])
+    expect(page.locator("#live-about")).to_contain_text("128 × 128 px · batch 1")
+    # A simulated mirror has no watcher of a projector.
+    expect(page.locator("#vsync-card")).to_be_hidden()
+    canvas = page.locator("#live-picture canvas.image")
+    canvas.hover(position={"x": 60, "y": 60})
+    expect(page.locator("#live-picture .readout")).to_contain_text("row ")
+    shots(page, "dots")
+    page.click("#tab-sessions")
+    page.locator("#sessions .choose").click()
+    expect(page.locator("#session canvas.image")).to_be_visible()
+    has_thumbnail(page)
+
+
+def has_thumbnail(page):
+    """The first session of the list has a small picture."""
+    thumbnail = page.locator("#sessions .choose img").first
+    expect(thumbnail).to_be_visible()
+    page.wait_for_function("image => image.complete && image.naturalWidth > 1", arg=thumbnail.element_handle())
 
 
 def viewfinder(page):
@@ -143,6 +218,9 @@ def questions(page):
         expect(page.locator("#question-text")).to_contain_text(wanted)
         if wanted == "white":
             shot(page, "question")
+            # In real time, the jitter of the VSYNC is told about once a second.
+            expect(page.locator("#vsync .u-wrap")).to_be_visible()
+            expect(page.locator("#vsync-text")).to_contain_text("16666.67 µs, jitter")
         page.click("#answer")
     expect(page.locator("#notes")).to_contain_text("The run is complete.")
     expect(page.locator("#notes")).to_contain_text("the run is over")
@@ -233,6 +311,7 @@ def visit(page, name):
     page.focus("#tab-run")
     page.keyboard.press("ArrowRight")
     page.locator(f"#sessions .choose[title='{last}']").click()
+    has_thumbnail(page)
     picture = page.locator("#session canvas.image").first
     expect(picture).to_be_visible()
     picture.focus()
@@ -265,6 +344,7 @@ with sync_playwright() as playwright:
             viewfinder(page)
             questions(page)
             warnings(page)
+            dot_rig(page)
             videos(page)
             earlier_picture(page)
             many_tabs(context)

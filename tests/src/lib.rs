@@ -53,10 +53,10 @@ pub fn corner_rig(more: &str) -> String {
     rig_text(128, &format!("scene = {:?}", data("p2r_corner.npz")), more)
 }
 
-/// A rig file of 720 projector rows for every second column of the corner scene: for tests of a minute and more, whose
-/// time is that of its pixels.
-pub fn half_corner_rig(more: &str) -> String {
-    rig_text(720, &format!("scene = {:?}", data("p2r_corner_half.npz")), more)
+/// A rig file for every second column of the corner scene: for tests of a minute and more, whose time is that of its
+/// pixels.
+pub fn half_corner_rig(rows: usize, more: &str) -> String {
+    rig_text(rows, &format!("scene = {:?}", data("p2r_corner_half.npz")), more)
 }
 
 /// One product of every kind that is possible for a camera of 24 x 16 pixels and a plan with an exposure of 250 us, one

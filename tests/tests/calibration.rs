@@ -84,7 +84,7 @@ fn message(ended: &Ended) -> &str {
 
 #[test]
 fn a_rig_that_nobody_knows_is_calibrated_and_swept() {
-    let bench = Bench::new(&half_corner_rig(UNKNOWN));
+    let bench = Bench::new(&half_corner_rig(720, UNKNOWN));
     let rig = Rig::load(&bench.folder.path().join("rig.toml")).unwrap();
     let sim = rig.simulated().unwrap();
     let uncalibrated = error(&bench.run(SWEEP), sim);
@@ -143,7 +143,10 @@ fn a_strip_of_the_board_cancels_jitter_that_no_device_measures() {
                 -333, -311, -289, 0, 289, 311, 333, 420, 640, 1000, 1500]\n";
     let columns = "strip_columns = [0, 8]\n";
     let rig = |of_rig: &str, of_sim: &str| {
-        half_corner_rig(&UNKNOWN.replace("[sim.truth]", &format!("{of_rig}[sim.board]\n{of_sim}[sim.truth]")))
+        half_corner_rig(
+            720,
+            &UNKNOWN.replace("[sim.truth]", &format!("{of_rig}[sim.board]\n{of_sim}[sim.truth]")),
+        )
     };
     let in_rig = format!("[calibration]\n{columns}");
     let error = |rig: &str| {
@@ -313,7 +316,7 @@ fn a_camera_that_is_not_linear_is_straightened_or_refused() {
     let camera = |percent: f64| {
         UNKNOWN.replace("[sim.sensor]\n", &format!("[sim.sensor]\ncompression_percent = {percent}\n"))
     };
-    let bench = Bench::new(&half_corner_rig(&camera(2.0)));
+    let bench = Bench::new(&half_corner_rig(720, &camera(2.0)));
     let rig = Rig::load(&bench.folder.path().join("rig.toml")).unwrap();
     let calibrated = bench.run(&quick());
     assert_eq!(calibrated.state, "complete", "{:?}", calibrated.error);
@@ -523,7 +526,7 @@ fn settings_that_the_rig_cannot_take_are_replaced_and_the_run_says_so() {
 fn wells_that_are_full_before_the_converter_are_found_and_what_fills_them_is_marked() {
     const FULL_DN: f64 = 3000.0;
     let sensor = format!("[sim.sensor]\nfull_well_e = {}\n", FULL_DN * 1.66);
-    let bench = Bench::new(&half_corner_rig(&sensor));
+    let bench = Bench::new(&half_corner_rig(720, &sensor));
     let rig = Rig::load(&bench.folder.path().join("rig.toml")).unwrap();
     let calibrated = bench.run(PLAN);
     assert_eq!(calibrated.state, "complete", "{:?}", calibrated.error);

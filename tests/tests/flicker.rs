@@ -35,7 +35,7 @@ fn metadata(session: &Path) -> serde_json::Value {
 
 /// A run of the sweep, and its median relative error of T.
 fn swept(ambient: &str) -> (Bench, Ended, f64) {
-    let bench = Bench::new(&half_corner_rig(ambient));
+    let bench = Bench::new(&half_corner_rig(720, ambient));
     let ended = bench.run(SWEEP);
     assert_eq!(ended.state, "complete", "{:?}", ended.error);
     let error = error_of(&bench, &ended);
@@ -139,13 +139,13 @@ fn film_errors(bench: &Bench, ended: &Ended) -> [f64; 2] {
 
 #[test]
 fn films_lose_a_lamp_that_flickers_after_their_first_cycles() {
-    let (bench, ended, state) = filmed(&half_corner_rig(STEADY), CYCLES);
+    let (bench, ended, state) = filmed(&half_corner_rig(720, STEADY), CYCLES);
     let steady = film_errors(&bench, &ended);
     assert_eq!(said_of_room(&state), (None, String::new()));
     // Each cycle of 15 frames at 60 frames/s sees 100 Hz in the same phase.
     for frequency_hz in [100, 99] {
         let ambient = FLICKERING.replace("100", &frequency_hz.to_string());
-        let (bench, ended, state) = filmed(&half_corner_rig(&ambient), CYCLES);
+        let (bench, ended, state) = filmed(&half_corner_rig(720, &ambient), CYCLES);
         let [first, later] = film_errors(&bench, &ended);
         let (said, warnings) = said_of_room(&state);
         println!("{frequency_hz} Hz: {said:?}");
@@ -197,7 +197,7 @@ fn neither_a_moving_scene_nor_jitter_is_taken_for_a_lamp() {
 
 #[test]
 fn a_film_warns_of_a_lamp_in_step_with_its_frames() {
-    let (_bench, _ended, state) = filmed(&half_corner_rig(&FLICKERING.replace("100", "120")), 5);
+    let (_bench, _ended, state) = filmed(&half_corner_rig(720, &FLICKERING.replace("100", "120")), 5);
     let (said, warnings) = said_of_room(&state);
     println!("{warnings}");
     assert_eq!(said, None);

@@ -139,8 +139,10 @@ fn every_picture_has_its_images_and_sessions_are_resumed_to_the_same_bits() {
 
 #[test]
 fn what_makes_the_products_worse_is_in_the_ledger_when_it_ends() {
-    let bench = bench("v-groove");
-    let ended = bench.run(&plan("[300]", "[[pattern]]\nkind = \"checkerboard\"\n"));
+    let sim = "scene = \"v-groove\"\nscene_rows = 16\nscene_columns = 16\nseed = 5";
+    let squares = "[[pattern]]\nkind = \"checkerboard\"\nsize_px = 4\nshifts = 32\n";
+    let bench = Bench::new(&rig_text(16, sim, ""));
+    let ended = bench.run(&plan("[200]", squares));
     let (session, state) = ended.open();
     let warnings = state.end.unwrap().warnings;
     let black = "the projector's black is not measured";

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use ndarray::{Array2, Array3, ArrayView3, Axis};
 use raysweep::control::Control;
 use raysweep_sim::scene::{Scene, SceneSize};
-use raysweep_tests::{Bench, Ended, corner_rig, data, rig_text};
+use raysweep_tests::{Bench, Ended, corner_rig, data, half_corner_rig, rig_text};
 use raysweep_transport::plane::{RowTiming, Setting, reach, relative_rows};
 use raysweep_transport::quality::{median_profile_error, relative_l2, share_near};
 use serde_json::Value;
@@ -166,12 +166,13 @@ fn a_flying_spot_costs_the_settings_that_it_cuts_and_nothing_else() {
         .collect();
     let plan = format!("kind = \"sweep\"\n[sweep]\ndelay_us = {delays:?}\nexposure_us = [600, 900]\n");
     let flying = "[sim.projector]\nspot = \"bidirectional\"\n";
-    let rig = corner_rig(&format!("{SENSOR}{flying}"));
+    let scene = read_scene(&data("p2r_corner_half.npz"));
+    let rig = half_corner_rig(128, &format!("{SENSOR}{flying}"));
     let known = rig.replace("row_time_us = 22.22\n[sim]", "row_time_us = 22.22\nspot = \"flying\"\n[sim]");
     let longest = || Setting::new(1500.0, 900.0);
     let bench = Bench::new(&known);
-    let (dropped, ended) = recover(&bench, &plan, corner().view(), longest());
-    let (ignored, _) = recover(&Bench::new(&rig), &plan, corner().view(), longest());
+    let (dropped, ended) = recover(&bench, &plan, scene.view(), longest());
+    let (ignored, _) = recover(&Bench::new(&rig), &plan, scene.view(), longest());
     assert!(dropped.profile < ignored.profile, "{dropped:?} {ignored:?}");
     assert!(dropped.profile < 0.03, "{dropped:?}");
     let report = |ended: &Ended| std::fs::read_to_string(ended.session.join("report.html")).unwrap();
@@ -182,7 +183,7 @@ fn a_flying_spot_costs_the_settings_that_it_cuts_and_nothing_else() {
         .replace("spot = \"flying\"", "spot = \"flying\"\nscan = \"bidirectional\"\nbeam_sigma_rows = 0.0")
         .replace("[vsync]", "projector_columns = [0, 1]\n[vsync]");
     let bench = Bench::new(&modelled);
-    let (modelled, ended) = recover(&bench, &plan, corner().view(), longest());
+    let (modelled, ended) = recover(&bench, &plan, scene.view(), longest());
     assert!(modelled.profile < 0.02 && modelled.own_row < 0.1, "{modelled:?}");
     assert!(report(&ended).contains("modelled in the"));
 }

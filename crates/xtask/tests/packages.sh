@@ -17,15 +17,18 @@ within() {
         ${https_proxy+"https_proxy=$https_proxy"} ${HTTPS_PROXY+"HTTPS_PROXY=$HTTPS_PROXY"} \
         ${no_proxy+"no_proxy=$no_proxy"} ${NO_PROXY+"NO_PROXY=$NO_PROXY"} chroot "$root" "$@"
 }
-# What xtask says of a package, by the name that this release has for it.
+# What xtask says of all packages.
+said() { within xtask packages 2>/dev/null || true; }
+# What it has last said of a package, by the name that this release has for it.
 state() {
-    { within xtask packages 2>/dev/null || true; } | while read -r state name why; do
+    echo "$last" | while read -r state name why; do
         [ "$name" != "$1" ] || echo "$state"
     done
 }
 has_candidate() { within apt-cache policy "$1" | grep -q '^ *Candidate: [0-9]'; }
 is_installed() { [ "$(within dpkg-query --show --showformat='${db:Status-Status}' "$1" 2>/dev/null)" = installed ]; }
 
+last=$(said)
 for names in $(sed 's/[[:space:]].*//; /^#/d; /^$/d' "$list"); do
     for package in $(echo "$names" | tr '|' ' '); do
         ! has_candidate "$package" || break
@@ -35,6 +38,7 @@ for names in $(sed 's/[[:space:]].*//; /^#/d; /^$/d' "$list"); do
     if ! is_installed "$package"; then
         within apt-get install --yes -qq --no-install-recommends "$package" >"$root/tmp/log" 2>&1 </dev/null || cat "$root/tmp/log"
         how=installed
+        last=$(said)
     fi
     echo "entry $names $before $how $(state "$package")"
 done

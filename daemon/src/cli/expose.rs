@@ -418,14 +418,20 @@ impl Proposed {
         let Self { tried: Tried { exposure_us, saturated, headroom, .. }, average, report, plan, .. } = self;
         let (rig, expected) = report.advice.as_ref().map(|advice| (&advice.rig, &advice.expected)).unzip();
         json!({
-            "exposure_us": exposure_us, "saturated": saturated, "headroom": headroom, "average": average,
+            "exposure_us": exposure_us, "saturated": saturated, "headroom": headroom, "gain_factor": self.gain_factor(),
+            "average": average,
             "light_s": report.light_s, "expected": expected, "rig": rig, "plan": plan, "warnings": report.warnings,
         })
     }
 
+    /// What the camera's gain is to be multiplied by, unless the aperture is opened by as much.
+    fn gain_factor(&self) -> f64 {
+        if self.tried.headroom > WORTHWHILE { self.tried.headroom } else { 1.0 }
+    }
+
     fn text(&self) -> String {
         let Self { tried, longest_us, average, report, plan } = self;
-        let Tried { exposure_us, saturated, headroom, .. } = tried;
+        let Tried { exposure_us, saturated, .. } = tried;
         let mut head = vec![format!(
             "exposures up to {exposure_us} us: {:.3} % of the pixels saturate (at most {:.2} % may)",
             100.0 * saturated,
@@ -434,11 +440,13 @@ impl Proposed {
         if exposure_us < longest_us {
             head.push(format!("longer ones, up to {longest_us} us, saturate more and are shortened"));
         }
-        if *headroom > WORTHWHILE {
-            head.push(format!(
-                "the scene may be {headroom:.2} times as bright, and a white board has at most 65 % of full scale then, which a calibration needs: open the aperture, or raise the gain, calibrate again, and try this again"
-            ));
-        }
+        head.push(match self.gain_factor() {
+            1.0 => "gain: as it is".to_owned(),
+            factor => format!(
+                "gain: {factor:.2} times ({:.1} dB) as much; the scene does not saturate then, and a white board has at most 65 % of full scale, which a calibration needs. Rather open the aperture by as much: that brings light, and a gain brings counts alone. Then calibrate again, and try this again",
+                20.0 * factor.log10()
+            ),
+        });
         if let Some(average) = average {
             head.push(format!(
                 "average = {average}: noise is then about as large as what averaging does not remove"
@@ -520,5 +528,20 @@ mod tests {
         // The simulated rig's white board has 58 % of full scale.
         assert_eq!(headroom_of_board(&values, None), f64::INFINITY);
         assert!((headroom_of_board(&values, Some(2300.0)) - 1.1295).abs() < 1e-4);
+    }
+
+    #[test]
+    fn a_gain_is_proposed_where_it_is_worth_a_calibration() {
+        let of = |headroom| {
+            let tried = Tried { exposure_us: 600.0, saturated: 0.0, suits: true, headroom };
+            let report = json!({ "points": 1, "extra_points": 0, "frames": 8, "light_s": 0.1, "memory_bytes": 1,
+                "memory_free_bytes": 2, "disk_bytes": 1, "disk_free_bytes": 2, "warnings": [] });
+            let (report, plan) = (serde_json::from_value(report).unwrap(), String::new());
+            Proposed { tried, longest_us: 600.0, average: Some(8), report, plan }
+        };
+        assert!(of(1.05).text().contains("# gain: as it is\n"), "{}", of(1.05).text());
+        assert_eq!(of(1.05).value()["gain_factor"], 1.0);
+        assert!(of(2.0).text().contains("# gain: 2.00 times (6.0 dB) as much;"), "{}", of(2.0).text());
+        assert_eq!(of(2.0).value()["gain_factor"], 2.0);
     }
 }
