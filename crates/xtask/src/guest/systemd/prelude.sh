@@ -38,7 +38,7 @@ as() { user=$1; shift; runuser -u "$user" -- "$@"; }
 newest() { ls -d "$DATA"/2*_* 2>/dev/null | tail -n 1; }
 points() { grep -c '"event":"point"' "$(newest)/ledger.jsonl"; }
 # Whether the run is in the middle of its points.
-is_midway() { [ -e "$(newest)/ledger.jsonl" ] && [ "$(points)" -ge 4 ]; }
+is_midway() { [ -e "$(newest)/ledger.jsonl" ] && [ "$(points)" -ge 6 ]; }
 is_complete() { tail -n 1 "$(newest)/ledger.jsonl" | grep -q '"complete"' && [ -s "$(newest)/manifest.json" ]; }
 bits() { sha256sum <"$(newest)/products/transport.npy"; }
 # Whether the newest session has the bits of the undisturbed one.
