@@ -131,7 +131,9 @@ fn examine_mirror(checkup: &mut Checkup, rig: &DotRig, data: &Path) {
         Ok(()) => checkup.ok(LIGHT, "permitted: the interlock is closed, or an operator has armed the light"),
         Err(why) => {
             let remedy = match section.interlock {
-                Some(_) => "close the enclosure; with an interlock, that alone decides",
+                Some(_) => {
+                    "close the enclosure: with an interlock, that alone decides; if it cannot be read, mend `mirror.interlock` first"
+                }
                 None => "make sure that it is safe, then `raysweep arm-light`",
             };
             checkup.warning(LIGHT, format!("not permitted: {why}"), remedy);

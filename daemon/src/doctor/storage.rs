@@ -59,7 +59,7 @@ pub(super) fn examine(checkup: &mut Checkup, data: &Path, needs: Option<PlanNeed
 
 /// How this user gets a data folder instead of one that they may not write, which may be anybody's.
 fn writable(folder: &Path) -> String {
-    let own = format!("give by --data a folder that {} may write", super::host::user());
+    let own = format!("give by --data a folder that `{}` may write", super::host::user());
     let owner = folder.metadata().ok().filter(fs::Metadata::is_dir);
     let owner = owner.and_then(|metadata| User::from_uid(Uid::from_raw(metadata.uid())).ok().flatten());
     // The daemon's folder is never root's.
