@@ -41,7 +41,7 @@ pub fn test(wanted: Guest) -> Done {
     has_space()?;
     // All failures at once: the next look at them is far away.
     let parts = std::thread::scope(|scope| {
-        // Most tests wait for the time of devices; what they leave of the cores, machines in emulation can use.
+        // Beside the tests, many of which wait for the time of devices, so that no core is idle at the end.
         let guests = scope.spawn(|| match wanted {
             Guest::Run => guest::both(&built),
             Guest::Skip => Ok(()),

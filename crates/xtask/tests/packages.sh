@@ -19,9 +19,9 @@ within() {
 }
 # What xtask says of all packages.
 said() { within xtask packages 2>/dev/null || true; }
-# What it has last said of a package, by the name that this release has for it.
+# What xtask has last said of a package, by the name that this release has for it.
 state() {
-    echo "$last" | while read -r state name why; do
+    printf '%s\n' "$last" | while read -r state name why; do
         [ "$name" != "$1" ] || echo "$state"
     done
 }

@@ -26,7 +26,8 @@ const FACTOR: f64 = 1.02;
 const PICTURES: u64 = 8;
 /// So many standard deviations of their number are allowed for.
 const CONFIDENCE: f64 = 1.6;
-/// A scene that could be this much brighter is worth opening the aperture for.
+/// A scene that could be this much brighter is worth opening the aperture for, and a board that is as much too bright is
+/// worth closing it.
 const WORTHWHILE: f64 = 1.1;
 /// With a larger expected error nothing is foreseen that frames are counted by, such as where the scenes that it is expected
 /// of saturate.
@@ -426,7 +427,8 @@ impl Proposed {
 
     /// What the camera's gain is to be multiplied by, unless the aperture is opened by as much.
     fn gain_factor(&self) -> f64 {
-        if self.tried.headroom > WORTHWHILE { self.tried.headroom } else { 1.0 }
+        let is_worthwhile = self.tried.headroom > WORTHWHILE || self.tried.headroom < 1.0 / WORTHWHILE;
+        if is_worthwhile { self.tried.headroom } else { 1.0 }
     }
 
     fn text(&self) -> String {
@@ -442,15 +444,22 @@ impl Proposed {
         }
         head.push(match self.gain_factor() {
             1.0 => "gain: as it is".to_owned(),
+            factor if factor < 1.0 => format!(
+                "gain: {factor:.2} times ({:+.1} dB) as much: a white board has more than the 65 % of full scale that a calibration needs, as far as the calibration in use or camera.white_dn tells. Or close the aperture by as much. The plan below is for the gain as it is: calibrate again, and try this again",
+                20.0 * factor.log10()
+            ),
             factor => format!(
-                "gain: {factor:.2} times ({:.1} dB) as much; the scene does not saturate then, and a white board has at most 65 % of full scale, which a calibration needs. Rather open the aperture by as much: that brings light, and a gain brings counts alone. Then calibrate again, and try this again",
+                "gain: {factor:.2} times ({:+.1} dB) as much: the scene does not saturate then, and a white board has at most 65 % of full scale, which a calibration needs, as far as the calibration in use or camera.white_dn tells. Better open the aperture by as much: that brings light, and a gain brings counts alone. The plan below is for the gain as it is: calibrate again, and try this again",
                 20.0 * factor.log10()
             ),
         });
         if let Some(average) = average {
-            head.push(format!(
-                "average = {average}: noise is then about as large as what averaging does not remove"
-            ));
+            head.push(match f64::from(*average) < MAX_AVERAGE {
+                true => format!(
+                    "average = {average}: with so many frames, the noise foreseen for the plan as it was is as large as what averaging was foreseen not to remove"
+                ),
+                false => format!("average = {average}, the most that is proposed; more would lower the noise further"),
+            });
         }
         head.push(format!("{:.2} s of light", report.light_s));
         if let Some(advice) = &report.advice {
@@ -541,7 +550,11 @@ mod tests {
         };
         assert!(of(1.05).text().contains("# gain: as it is\n"), "{}", of(1.05).text());
         assert_eq!(of(1.05).value()["gain_factor"], 1.0);
-        assert!(of(2.0).text().contains("# gain: 2.00 times (6.0 dB) as much;"), "{}", of(2.0).text());
+        assert!(of(2.0).text().contains("# gain: 2.00 times (+6.0 dB) as much:"), "{}", of(2.0).text());
         assert_eq!(of(2.0).value()["gain_factor"], 2.0);
+        // A board that is too bright, of which the scene need not show anything.
+        assert!(of(0.72).text().contains("# gain: 0.72 times (-2.9 dB) as much: a white board has more"));
+        assert_eq!(of(0.72).value()["gain_factor"], 0.72);
+        assert!(of(0.95).text().contains("# gain: as it is\n"));
     }
 }

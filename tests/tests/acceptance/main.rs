@@ -199,7 +199,7 @@ fn a_second_board_tells_the_beam_from_the_board() {
         let spread_rows = (wide.powi(2) - narrow.powi(2)).sqrt();
         println!("{wide:.3} and {narrow:.3} rows wide, so the first board spreads by {spread_rows:.3} rows");
         assert!((spread_rows / scatter_rows - 1.0).abs() < 0.1);
-        // What one board misleads by is plain with the wider spread.
+        // Errors of sweeps, which take long, with the wider spread alone: there it is plain what one board misleads by.
         if scatter_rows < 0.5 {
             continue;
         }
