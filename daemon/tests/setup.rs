@@ -173,6 +173,10 @@ fn wrong_answers_write_nothing_and_name_what_is_allowed() {
             "camera = 'v4l2:/none'\ncontrols = 'gain'",
             "controls = \"gain\": \"gain\" is not NAME=WHOLE NUMBER",
         ),
+        (
+            "camera = 'v4l2:/none'\nprojector = 'bench'\nvsync = 'bench'\nscene = '128'",
+            "scene = \"128\": scene \"128\": no such built-in scene; choose one of v-groove, ",
+        ),
         ("camera = 'v4l2:/none'\npixel_format = 'Mono13'", "pixel_format = \"Mono13\": "),
         ("kind = 'dots'\ncamera = 'sim'\nmirror = 'optotune:/dev/null'", "laser_port = \"\": an Optotune"),
     ] {

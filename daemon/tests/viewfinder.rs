@@ -1,14 +1,17 @@
 //! The viewfinder on simulated rigs: what it shows, what clients change, and how it ends.
 #![expect(clippy::unwrap_used, reason = "a helper of a test fails the test")]
 
+mod daemon;
 mod process;
+mod program;
 
-use std::process::{Command, Output, Stdio};
+use std::process::Stdio;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::Signal;
 use process::HUNG;
+use program::Program;
 use raysweep::Probes;
 use raysweep::Runner;
 use raysweep::control::Control;
@@ -20,7 +23,6 @@ use raysweep_proto::{
     Client, ErrorCode, Event, ResumeParams, RunParams, RunState, ViewfinderParams, ViewfinderValues,
 };
 use raysweep_session::Session;
-use raysweep_sim::scene::Scene;
 use raysweep_sim::{LensControl, LensOf, PlaneTruth};
 use tempfile::TempDir;
 use tokio::sync::broadcast;
@@ -396,153 +398,6 @@ fn the_dot_of_a_dot_rig_has_its_place_size_and_peak() {
     let mut tilted = View::new(DOTS, "tilt_deg = [1.0, 0.0]\n");
     let moved = tilted.picture(|values| values.dot.is_some()).dot.unwrap();
     assert!((moved.column - dot.column).abs() > 3.0, "{dot:?} and {moved:?}");
-}
-
-/// The command line and a daemon of its own.
-struct Program {
-    folder: TempDir,
-    _daemon: process::Process,
-}
-
-impl Program {
-    fn start(rig: &str) -> Self {
-        let folder = tempfile::tempdir().unwrap();
-        std::fs::write(folder.path().join("rig.toml"), rig).unwrap();
-        let mut command = Command::new(env!("CARGO_BIN_EXE_raysweepd"));
-        command.current_dir(&folder).args(["--rig", "rig.toml", "--socket", "socket", "--data", "sessions"]);
-        let daemon = process::Process::start(command.stderr(Stdio::null()));
-        let program = Self { folder, _daemon: daemon };
-        process::wait_for("the daemon does not answer", || {
-            program.raysweep(&["status"]).status.success().then_some(())
-        });
-        program
-    }
-
-    fn command(&self, arguments: &[&str]) -> Command {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_raysweep"));
-        command.current_dir(&self.folder).args(["--socket", "socket"]).args(arguments);
-        command
-    }
-
-    fn raysweep(&self, arguments: &[&str]) -> Output {
-        self.command(arguments).output().unwrap()
-    }
-
-    /// What `expose` proposes for the plan, the exposure of it, and the rig.
-    fn expose(&self) -> (serde_json::Value, f64, Rig) {
-        let output = self.raysweep(&["--json", "expose", "plan.toml"]);
-        let said = String::from_utf8(output.stdout).unwrap();
-        assert!(output.status.success(), "{said} {}", String::from_utf8_lossy(&output.stderr));
-        let proposed: serde_json::Value = serde_json::from_str(&said).unwrap();
-        let exposure_us = proposed["exposure_us"].as_f64().unwrap();
-        (proposed, exposure_us, Rig::load(&self.folder.path().join("rig.toml")).unwrap())
-    }
-
-    fn plan(&self, text: &str) {
-        std::fs::write(self.folder.path().join("plan.toml"), text).unwrap();
-    }
-}
-
-/// A scene whose white is brighter than the rig file says.
-const BRIGHT: &str = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver = \"sim\"\n[projector]\ndriver = \"sim\"\n\
-                      [sim]\nscene = \"mix\"\nscene_rows = 96\nscene_columns = 96\nseed = 9\n[sim.truth]\nwhite_dn = 2800\n";
-
-/// What the sensor makes of the scene in an exposure, from the light alone and the sensor's data: the share of samples
-/// above the limit, and the median signal over noise.
-fn brute_force(rig: &Rig, delay_us: f64, exposure_us: f64) -> (f64, f64) {
-    let light = rig.simulated().unwrap().noise_free(delay_us, exposure_us).unwrap();
-    let signals_e: Vec<f64> = light.iter().map(|&light| f64::from(light) * 2800.0 * 1.66).collect();
-    let noise_e = |e: f64| (81.0 + e).sqrt();
-    let limit_e = (0.97 * 4095.0 - 64.0) * 1.66;
-    // Logistic approximation of the normal distribution's tail.
-    let above = |e: f64| 1.0 / (1.0 + (1.702 * (limit_e - e) / noise_e(e)).exp());
-    let share = signals_e.iter().map(|&e| above(e)).sum::<f64>() / signals_e.len() as f64;
-    let mut ratios: Vec<f64> = signals_e.iter().map(|&e| e / noise_e(e)).collect();
-    ratios.sort_by(f64::total_cmp);
-    (share, ratios[ratios.len() / 2])
-}
-
-#[test]
-fn no_exposure_is_proposed_of_a_scene_that_is_not_seen() {
-    let program = Program::start(&BRIGHT.replace("white_dn = 2800", "white_dn = 1"));
-    program.plan("kind = \"sweep\"\n[sweep]\ndelay_us = [0]\nexposure_us = [100, 1000]\n");
-    let output = program.raysweep(&["expose", "plan.toml"]);
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert!(!output.status.success() && said.contains("sees hardly any light"), "{said}");
-}
-
-#[test]
-fn the_proposed_exposure_saturates_nothing_and_is_as_good_as_the_best_of_all() {
-    let program = Program::start(BRIGHT);
-    program.plan("kind = \"sweep\"\nname = \"mine\"\n[sweep]\ndelay_us = [-300, 0, 300]\nexposure_us = [100, 1000, 15000]\n");
-    let (proposed, exposure_us, rig) = program.expose();
-    let (_, ratio) = brute_force(&rig, 0.0, exposure_us);
-    let best = (0..=100)
-        .map(|step| 100.0 * 150_f64.powf(f64::from(step) / 100.0))
-        .map(|us| (us, brute_force(&rig, 0.0, us)))
-        .filter(|(_, (share, _))| *share <= 1e-4)
-        .max_by(|(_, (_, a)), (_, (_, b))| a.total_cmp(b))
-        .unwrap();
-    let mut view = View::new(BRIGHT, &format!("exposure_us = {exposure_us:?}\n"));
-    let saturated = (0..30).map(|_| view.picture(|_| true).saturated).sum::<f64>() / 30.0;
-    println!("{exposure_us} us: {saturated:.1e} saturated, SNR {ratio:.2}; best {best:?}; {proposed}");
-    assert!(saturated <= 1e-4, "{saturated} in {exposure_us} us");
-    assert!(ratio >= 0.95 * best.1.1, "{ratio} in {exposure_us} us; best {best:?}");
-    assert!(best.0 < 14_000.0, "the longest exposure saturates, or nothing was to be found");
-    // The plan is whole, and has no longer exposure.
-    let plan = proposed["plan"].as_str().unwrap();
-    let plan = raysweep_config::Plan::parse(plan).unwrap();
-    let raysweep_config::Procedure::Sweep(sweep) = &plan.procedure else { panic!("{plan:?}") };
-    let kept = [100.0, 1000.0, 15_000.0].into_iter().filter(|us| *us < exposure_us).chain([exposure_us]);
-    assert_eq!((plan.name.as_str(), sweep.exposure_us.values()), ("mine", kept.collect()));
-    assert_eq!(proposed["average"], sweep.average);
-    assert!(proposed["expected"]["noise"]["median"].as_f64().unwrap() > 0.0);
-    // It has left the daemon idle, and says so to people too.
-    assert!(String::from_utf8(program.raysweep(&["status"]).stdout).unwrap().contains("idle"));
-    program.plan("kind = \"darks\"\n");
-    let refused = program.raysweep(&["expose", "plan.toml"]);
-    assert!(String::from_utf8(refused.stderr).unwrap().contains("no exposures to choose"));
-}
-
-/// Its own row hardly lights a pixel, five rows further down light it strongly: at delay 0, no exposure of the plan saturates.
-#[test]
-fn the_proposed_exposure_suits_the_delay_at_which_the_scene_is_brightest() {
-    const ROWS: usize = 96;
-    let folder = tempfile::tempdir().unwrap();
-    let scene = folder.path().join("scene.npz");
-    let light = |v: usize, t: usize| match v.checked_sub(t) {
-        Some(0) => 0.05,
-        Some(14..=18) => 0.4,
-        _ => 0.0,
-    };
-    let transport = ndarray::Array4::from_shape_fn((ROWS, ROWS, 24, 1), |(v, t, _, _)| light(v, t));
-    Scene::from_transport(transport, None).unwrap().save(&scene).unwrap();
-    let rig = BRIGHT
-        .replace("\"mix\"\nscene_rows = 96\nscene_columns = 96", &format!("{:?}", scene.to_str().unwrap()));
-    assert_ne!(rig, BRIGHT);
-    let program = Program::start(&rig);
-    program.plan(
-        "kind = \"sweep\"\n[sweep]\ndelay_us = [-355, 0, 355]\nexposure_us = [20, 40, 80, 160, 320, 500]\n",
-    );
-    let (_, exposure_us, rig) = program.expose();
-    let share = |delay_us, exposure_us| brute_force(&rig, delay_us, exposure_us).0;
-    assert!(share(0.0, 500.0) < 1e-4, "delay 0 tells nothing");
-    let shares = [exposure_us, 1.1 * exposure_us].map(|us| share(355.0, us));
-    println!("{exposure_us} us: saturated {shares:?}");
-    assert!(shares[0] <= 1e-4 && shares[1] > 1e-4, "{shares:?} in {exposure_us} us and a tenth more");
-}
-
-#[test]
-fn a_scene_that_saturates_in_every_exposure_needs_less_light() {
-    let program = Program::start(&BRIGHT.replace("white_dn = 2800", "white_dn = 9000"));
-    program.plan("kind = \"sweep\"\n[sweep]\ndelay_us = [-300, 0, 300]\nexposure_us = [600]\n");
-    let refused = program.raysweep(&["expose", "plan.toml"]);
-    let said = String::from_utf8(refused.stderr).unwrap();
-    assert_eq!(refused.status.code(), Some(1), "{said}");
-    assert!(
-        said.contains("even in the plan's shortest exposure, 600 us") && said.contains("close the aperture"),
-        "{said}"
-    );
 }
 
 #[test]

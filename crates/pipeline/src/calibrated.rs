@@ -71,7 +71,11 @@ impl CalibrationDrift {
                         ));
                     }
                 }
-                let kept = if is_certain { "" } else { ", too uncertain to be used" };
+                let kept = match (is_certain, self.warnings.is_empty()) {
+                    (false, _) => ", too uncertain to be used",
+                    (true, true) => ", corrected; so little is no reason to calibrate again",
+                    (true, false) => ", corrected; see the warning",
+                };
                 format!("{comes} (± {sd_us:.2} us), from {} pixels{kept}", found.pixels)
             }
         };

@@ -103,9 +103,12 @@ pub fn choose(
         let valid = stack.valid.as_ref().map(|valid| valid.view());
         Sample::of_rows(stack.timing.clone(), stack.settings.clone(), rows, images.view(), valid)
     };
+    let ratios = frames_of(&stack).into_iter().zip(&stack.dark_frames);
+    let frames_per_dark_frame =
+        ratios.map(|(frames, &dark)| frames as f64 / dark as f64).sum::<f64>() / stack.settings.len() as f64;
     let ((noise, coupling, coupled), optics) = rayon::join(
         || {
-            let noise = fit_noise(&stack, &mut findings);
+            let noise = fit_noise(&stack, frames_per_dark_frame, &mut findings);
             let coupling = noise.filter(|_| options.coupling).map(|_| Coupling::default());
             let coupled = noise.zip(coupling).map(|(noise, coupling)| couple(&coupling, &noise, &stack));
             (noise, coupling, coupled)
@@ -146,10 +149,7 @@ pub fn choose(
     };
     // A spot that cannot be modelled is told here.
     cut.modelled_by(demux.with_settings(settings)?)?;
-    let ratios = frames_of(&stack).into_iter().zip(&stack.dark_frames);
-    let ratio =
-        ratios.map(|(frames, &dark)| frames as f64 / dark as f64).sum::<f64>() / stack.settings.len() as f64;
-    let noise_without_darks = noise.map(|noise| noise.without_darks(ratio));
+    let noise_without_darks = noise.map(|noise| noise.without_darks(frames_per_dark_frame));
     let geometry = geometry.clone();
     Ok(Choices { demux, geometry, late_us, calibration, noise, noise_without_darks, coupling, findings })
 }
@@ -364,11 +364,12 @@ fn frames_of(stack: &SweepStack) -> Vec<usize> {
     stack.settings.iter().map(|setting| setting.delays_us.len()).collect()
 }
 
-fn fit_noise(stack: &SweepStack, findings: &mut Findings) -> Option<NoiseModel> {
+fn fit_noise(stack: &SweepStack, frames_per_dark_frame: f64, findings: &mut Findings) -> Option<NoiseModel> {
     let valid = stack.valid.as_ref().map(|valid| valid.view());
     match NoiseModel::fit(stack.images.view(), valid, &frames_of(stack)) {
         Ok(noise) => {
-            let sd = |light| noise.variance(light, 1).sqrt();
+            let of_frame = noise.without_darks(frames_per_dark_frame);
+            let sd = |light| of_frame.variance(light, 1).sqrt();
             let said = format!("{:.4} in the dark, {:.4} at the light of one white row", sd(0.0), sd(1.0));
             findings.remarks.push(("noise of a frame", said));
             Some(noise)

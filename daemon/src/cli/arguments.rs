@@ -295,7 +295,7 @@ pub enum Command {
     Export {
         /// The session's folder, or its name within the daemon's data folder
         session: PathBuf,
-        /// The folder or archive to create [default: the session's name with `-export`, in the current folder]
+        /// The folder or archive to create [default: the session's name with `-export` and the format, in the current folder]
         #[arg(long, value_name = "PATH")]
         to: Option<PathBuf>,
         /// Products alone in the format of another program, with a README of their axes and units; `zip` archives the copy

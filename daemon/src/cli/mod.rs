@@ -398,9 +398,10 @@ const STACK_WITH_FORMAT: &str =
 fn export_path(session: &Path, format: Option<ExportFormat>) -> PathBuf {
     let session = fs::canonicalize(session).unwrap_or_else(|_| session.to_owned());
     let mut name = session.file_name().unwrap_or_default().to_owned();
-    name.push("-export");
-    if format == Some(ExportFormat::Zip) {
-        name.push(".zip");
+    match format {
+        None => name.push("-export"),
+        Some(ExportFormat::Zip) => name.push("-export.zip"),
+        Some(format) => name.push(format!("-export-{}", format.described().0)),
     }
     name.into()
 }

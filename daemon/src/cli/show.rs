@@ -323,10 +323,12 @@ pub(super) fn sessions(sessions: &[SessionInfo], left_out: usize) -> String {
     match left_out {
         0 => listed,
         1 => {
-            format!("{listed}\n1 viewfinder, which holds no images, is left out; --kind viewfinder lists it")
+            format!(
+                "{listed}\n1 session of a viewfinder, which holds no images, is left out; --kind viewfinder lists it"
+            )
         }
         _ => format!(
-            "{listed}\n{left_out} viewfinders, which hold no images, are left out; --kind viewfinder lists them"
+            "{listed}\n{left_out} sessions of viewfinders (`expose` uses one, too), which hold no images, are left out; --kind viewfinder lists them"
         ),
     }
 }

@@ -24,6 +24,7 @@ use self::simulated::{Simulated, simulate};
 use self::vsync::Unwatched;
 
 pub use self::dots::{DotDevices, DotRig};
+pub use self::simulated::check_scene;
 pub use self::stand::Stand;
 
 /// Why a rig cannot be used.

@@ -8,9 +8,22 @@ use raysweep_config::rig::plane::CameraDriver;
 use raysweep_core::{Camera, Clock, DeviceError, Pattern, Projector, Shown, Subject, Vsync};
 use raysweep_drivers::projector::external::External;
 use raysweep_sim::bench::{RemoteProjector, RemoteVsync, remote_subject};
+use raysweep_sim::scene::{BUILTIN_NAMES, MOVING_NAMES, SceneError};
 use raysweep_sim::{PlaneDevices, PlaneRig, PlaneSetup, SimError, SubjectSwitch};
 
 use super::{Rig, RigError, Stand};
+
+/// Whether a scene can be what `sim.scene` names: a built-in scene, or a file, which is not looked for.
+///
+/// # Errors
+/// [`SceneError::UnknownName`], which lists the built-in scenes.
+pub fn check_scene(name: &str) -> Result<(), SceneError> {
+    let mut known = BUILTIN_NAMES.iter().chain(&MOVING_NAMES);
+    match known.any(|known| *known == name) || name.ends_with(".npz") {
+        true => Ok(()),
+        false => Err(SceneError::UnknownName { name: name.to_owned() }),
+    }
+}
 
 /// Builds the simulated rig that a file describes; scene paths are relative to `folder`.
 pub(super) fn simulate(file: &RigFile, folder: &Path) -> Result<PlaneRig, SimError> {

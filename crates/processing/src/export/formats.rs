@@ -194,8 +194,13 @@ fn beginning(session: &Session, format: ExportFormat) -> String {
             "The session's own files. Of each NumPy array, the `.json` file beside it has all that is known of it."
         }
     };
+    let more = match format {
+        ExportFormat::Zip => "",
+        ExportFormat::Npy => " The session has more: settings, the ledger.",
+        _ => " The session has more: masks, settings, the ledger.",
+    };
     format!(
-        "# {name}\n\n{what} t is the camera row, top row first, s the camera column. The session has more: masks, settings, the ledger.\n\n| file | axes | units | scale | content |\n| --- | --- | --- | --- | --- |\n"
+        "# {name}\n\n{what} t is the camera row, top row first, s the camera column.{more}\n\n| file | axes | units | scale | content |\n| --- | --- | --- | --- | --- |\n"
     )
 }
 

@@ -47,7 +47,7 @@ fn inverses(quadratic: &Quadratic) -> Result<Compared, Box<dyn Error>> {
     let h: Vec<f64> = quadratic.h().iter().copied().collect();
     let own = || {
         let mut matrix = h.clone();
-        pulp::Arch::new().dispatch(|| invert(&mut matrix, n)).ok().map(|()| matrix)
+        invert(&mut matrix, n).ok().map(|()| matrix)
     };
     let other = || Cholesky::new(DMatrix::from_column_slice(n, n, &h)).map(|factor| factor.inverse());
     let (seconds, nalgebra_seconds) = take_turns(own, other);

@@ -21,7 +21,7 @@ use axum::body::Bytes;
 use axum::extract::{DefaultBodyLimit, Path as Segment, Query, State};
 use axum::http::{StatusCode, header};
 use axum::response::sse::{KeepAlive, Sse};
-use axum::response::{IntoResponse, Response};
+use axum::response::{IntoResponse, Redirect, Response};
 use axum::routing::{get, post};
 use axum::{Json, Router, middleware};
 use raysweep_proto::{Client, ClientError, ErrorCode, Method, Role, RpcError, Status};
@@ -143,7 +143,10 @@ fn routes(view: Arc<View>, guard: Guard) -> Router {
         let answer = move || async move { ([(header::CONTENT_TYPE, kind)], content) };
         pages = pages.route(&format!("/{{token}}/{name}"), get(answer));
     }
+    // Files of the page are named relative to its folder.
+    let folder = |Segment(token): Segment<String>| async move { Redirect::permanent(&format!("/{token}/")) };
     pages
+        .route("/{token}", get(folder))
         .route("/{token}/call", post(call))
         .route("/{token}/events", get(events))
         .route("/{token}/live", get(live))

@@ -85,10 +85,16 @@ pub fn setup(files: &SetupFiles<'_>, printer: Printer) -> Result<Exit, CommandFa
     let value = json!({ "rig": rig, "plan": plan, "connected": connected });
     printer.print(&value, |_| {
         format!(
-            "written: {0} and {1}\nnext: `raysweep doctor --rig {0}`; then start the daemon with it, {2}`raysweep run {1}`",
+            "written: {0} and {1}\nnext: `raysweep doctor --rig {0}`; then start the daemon with it, focus with `raysweep viewfinder`, {2}",
             rig.display(),
             plan.display(),
-            if kind == "plane" { "`raysweep calibrate`, and " } else { "and " }
+            match kind.as_str() {
+                "plane" => format!(
+                    "align with `raysweep viewfinder --picture align --board`, `raysweep calibrate`, `raysweep expose {0} > plan.toml`, and `raysweep run plan.toml`",
+                    plan.display()
+                ),
+                _ => format!("and `raysweep run {}`", plan.display()),
+            }
         )
     })?;
     Ok(Exit::Done)

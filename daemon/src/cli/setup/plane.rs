@@ -10,6 +10,7 @@ use super::found::ConnectedDevices;
 use super::questions::{AnswerChoice, Questions};
 use super::text::RigText;
 use crate::cli::failure::CommandFailure;
+use crate::rig::check_scene;
 
 /// Lines of a video frame for each line that is drawn: those of 720p60.
 const LINES_PER_ROW: f64 = 750.0 / 720.0;
@@ -62,7 +63,7 @@ pub(super) fn ask(questions: &mut Questions, connected: &ConnectedDevices) -> Re
                     "Socket of the raysweep-sim-camera that simulates VSYNC and projector",
                     "bench.sock",
                 )?;
-                let scene = questions.text("scene", "What the simulated camera sees", "v-groove")?;
+                let scene = questions.read("scene", "What the simulated camera sees", "v-groove", scene)?;
                 let side = questions.whole("scene_rows", "Rows and columns of that scene", 128, 8..=1024)?;
                 text.table("sim")
                     .key("bench", socket)
@@ -76,6 +77,11 @@ pub(super) fn ask(questions: &mut Questions, connected: &ConnectedDevices) -> Re
             false => text,
         };
     Ok(text.finish())
+}
+
+/// The name of a scene, which the simulated camera reads only when it is started.
+fn scene(name: &str) -> Result<String, String> {
+    check_scene(name).map(|()| name.to_owned()).map_err(|error| error.to_string())
 }
 
 fn ask_projector(

@@ -7,6 +7,7 @@ use aligned_vec::{AVec, avec};
 use pulp::Simd;
 
 use super::quadratic::Padded;
+use super::simd::MAX_LANES;
 
 /// Rows and columns of the blocks in which matrices are factored: sums of 4 x 2 fit in the registers at every vector
 /// width.
@@ -14,9 +15,6 @@ const BLOCK: usize = 4;
 
 /// Number of vectors in a sum of columns; they fit in the registers at every vector width.
 const SUMS: usize = 8;
-
-/// Number of lanes in the widest registers, those of AVX-512.
-pub(super) const MAX_LANES: usize = 8;
 
 /// Memory for the systems of all lanes; arrays interleave the lanes' values. Lanes share the symmetric matrix `M`, of
 /// which each uses its own rows and columns `K`. The result of a lane is the same to the bit whatever the other lanes

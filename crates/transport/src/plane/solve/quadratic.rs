@@ -5,8 +5,8 @@ use ndarray::{Array2, ArrayView1, ArrayView2, Axis, ShapeBuilder, aview2};
 
 use super::super::PlaneError;
 use super::super::model::Slot;
-use super::dense::MAX_LANES;
 use super::narrow::Narrow;
+use super::simd::MAX_LANES;
 use super::{Prior, cholesky};
 
 /// Relative increase of the diagonal of `H`. Rows that the settings leave undetermined then have a unique solution,
@@ -239,9 +239,7 @@ fn invert(h: ArrayView2<f64>) -> Result<Array2<f64>, PlaneError> {
     // Scaled to a unit diagonal, because smoothness far from u = 0 weighs a million times more than the data.
     let scale: Vec<f64> = h.diag().iter().map(|diagonal| diagonal.sqrt().recip()).collect();
     let mut matrix: Vec<f64> = h.indexed_iter().map(|((i, j), value)| value * scale[i] * scale[j]).collect();
-    pulp::Arch::new()
-        .dispatch(|| cholesky::invert(&mut matrix, n))
-        .map_err(|cholesky::NotPositiveDefinite| PlaneError::NotConvex)?;
+    cholesky::invert(&mut matrix, n).map_err(|cholesky::NotPositiveDefinite| PlaneError::NotConvex)?;
     Ok(Array2::from_shape_fn((n, n), |(i, j)| matrix[i.max(j) * n + i.min(j)] * scale[i] * scale[j]))
 }
 

@@ -1,5 +1,8 @@
 use pulp::{Scalar, Simd, WithSimd};
 
+/// Number of lanes in the widest registers, those of AVX-512.
+pub(super) const MAX_LANES: usize = 8;
+
 /// The instruction set that the solver uses. All give the same transport to rounding; with one level it is the same
 /// to the bit for any number of threads.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
