@@ -96,7 +96,7 @@ impl Computing {
 
 /// Whether no run is in progress.
 fn is_free(state: RunState) -> bool {
-    matches!(state, RunState::Idle | RunState::Faulted)
+    state.is_over()
 }
 
 fn busy(why: &str) -> RpcError {

@@ -188,7 +188,7 @@ impl Runner {
     pub fn close_if_idle(&self) -> bool {
         // No run can begin while this is locked.
         let _current = self.current.lock().unwrap_or_else(PoisonError::into_inner);
-        let is_idle = matches!(self.board.status().state, RunState::Idle | RunState::Faulted);
+        let is_idle = self.board.status().state.is_over();
         if is_idle {
             self.closed.store(true, Ordering::Relaxed);
         }
@@ -555,7 +555,16 @@ impl Control for Runner {
     }
 
     fn sessions(&self) -> Result<Vec<SessionInfo>, RpcError> {
-        self.computing.now(|| sessions_in(&self.data)).map_err(|error| storage(&error))
+        let mut sessions = self.computing.now(|| sessions_in(&self.data)).map_err(|error| storage(&error))?;
+        let status = self.board.status();
+        let is_under_way = |info: &&mut SessionInfo| {
+            !status.state.is_over() && status.session.as_ref() == Some(&info.session)
+        };
+        if let Some(info) = sessions.iter_mut().find(is_under_way) {
+            info.state = "running".into();
+            info.can_resume = false;
+        }
+        Ok(sessions)
     }
 
     fn calibrations(&self) -> Result<Vec<CalibrationInfo>, RpcError> {
@@ -591,7 +600,7 @@ impl Control for Runner {
             RpcError::new(ErrorCode::NotRunning, what)
         };
         let current = self.lock();
-        let is_over = matches!(self.board.status().state, RunState::Idle | RunState::Faulted);
+        let is_over = self.board.status().state.is_over();
         let current = current.as_ref().filter(|_| !is_over).ok_or_else(none)?;
         current.orders.look.change(wanted).map_err(|NoViewfinder| none())
     }

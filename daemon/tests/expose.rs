@@ -6,6 +6,7 @@ mod daemon;
 mod process;
 mod program;
 
+use std::io::Read;
 use std::path::Path;
 use std::process::Stdio;
 
@@ -13,7 +14,8 @@ use nix::sys::signal::Signal;
 use process::{Process, wait_for};
 use program::Program;
 use raysweep::rig::Rig;
-use raysweep_proto::{Event, RunParams, RunState, ViewfinderParams};
+use raysweep_core::FinderPicture;
+use raysweep_proto::{Client, Event, RunParams, RunState, ViewfinderParams};
 use raysweep_sim::scene::Scene;
 
 /// What `expose` proposes for the plan, the exposure of it, and the rig.
@@ -44,7 +46,7 @@ fn saturated(program: &mut Program, [exposure_us, delay_us]: [f64; 2]) -> f64 {
     });
     let saturated = shares.take(30).sum::<f64>() / 30.0;
     client.cancel().unwrap();
-    wait_for("the end", || (client.status().unwrap().state == RunState::Idle).then_some(()));
+    wait_for("the end", || client.status().unwrap().state.is_over().then_some(()));
     saturated
 }
 
@@ -129,13 +131,13 @@ fn the_proposed_exposure_saturates_nothing_and_is_as_good_as_the_best_of_all() {
     assert!(String::from_utf8(refused.stderr).unwrap().contains("no exposures to choose"));
 }
 
-/// The rig with a scene in which its own row hardly lights a pixel, and five rows further down light it strongly.
-fn with_indirect_light(rig: &str, folder: &Path) -> String {
+/// The rig with a scene in which its own row lights a pixel so much, and each of five rows, from so many further down on.
+fn with_indirect_light(rig: &str, folder: &Path, own: f32, down: usize, each: f32) -> String {
     const ROWS: usize = 96;
     let scene = folder.join("scene.npz");
     let light = |v: usize, t: usize| match v.checked_sub(t) {
-        Some(0) => 0.05,
-        Some(14..=18) => 0.4,
+        Some(0) => own,
+        Some(rows) if (down..down + 5).contains(&rows) => each,
         _ => 0.0,
     };
     let transport = ndarray::Array4::from_shape_fn((ROWS, ROWS, 24, 1), |(v, t, _, _)| light(v, t));
@@ -150,7 +152,7 @@ fn with_indirect_light(rig: &str, folder: &Path) -> String {
 #[test]
 fn the_proposed_exposure_suits_the_delay_at_which_the_scene_is_brightest() {
     let folder = tempfile::tempdir().unwrap();
-    let rig = with_indirect_light(BRIGHT, folder.path());
+    let rig = with_indirect_light(BRIGHT, folder.path(), 0.05, 14, 0.4);
     let program = Program::start(&rig);
     program.plan(
         "kind = \"sweep\"\n[sweep]\ndelay_us = [-355, 0, 355]\nexposure_us = [20, 40, 80, 160, 320, 500]\n",
@@ -171,7 +173,7 @@ fn a_scene_that_saturates_in_every_exposure_needs_less_light() {
     let said = String::from_utf8(refused.stderr).unwrap();
     assert_eq!(refused.status.code(), Some(1), "{said}");
     assert!(
-        said.contains("even in the plan's shortest exposure, 600 us") && said.contains("close the aperture"),
+        said.contains("even in the shortest exposure, 150 us") && said.contains("close the aperture"),
         "{said}"
     );
 }
@@ -181,7 +183,8 @@ fn a_scene_that_saturates_in_every_exposure_needs_less_light() {
 #[test]
 fn the_gain_that_is_proposed_fits() {
     let folder = tempfile::tempdir().unwrap();
-    let (of_boards, of_scene) = (BRIGHT.to_owned(), with_indirect_light(BRIGHT, folder.path()));
+    let (of_boards, of_scene) =
+        (BRIGHT.to_owned(), with_indirect_light(BRIGHT, folder.path(), 0.05, 14, 0.4));
     for (rig, delay_us, exposure_us, is_scene_the_limit) in
         [(of_boards, 0.0, 200.0, false), (of_scene, 355.0, 500.0, true)]
     {
@@ -217,22 +220,25 @@ fn the_gain_that_is_proposed_fits() {
     }
 }
 
+/// In which nothing saturates, so that noise decides nothing.
 #[test]
 fn a_proposal_is_proposed_again_as_it_is() {
-    let program = Program::start(BRIGHT);
-    program.plan("# Mine.\nkind = \"sweep\"\n[sweep]\ndelay_us = { start = -1500, stop = 1500, count = 15 }\nexposure_us = [100, 1000]\n");
+    let program = Program::start(&BRIGHT.replace("white_dn = 2800", "white_dn = 900"));
+    program.plan("# Mine.\nkind = \"sweep\"\n[sweep]\ndelay_us = { start = -1500, stop = 1500, count = 15 }\nexposure_us = { start = 600, stop = 1200, count = 5 }\naverage = 2\n");
     let proposal = || {
         let output = program.raysweep(&["--quiet", "expose", "plan.toml"]);
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
         String::from_utf8(output.stdout).unwrap()
     };
-    let without_comments = |text: &str| {
-        text.lines().filter(|line| !line.starts_with("#  ")).map(str::to_owned).collect::<Vec<_>>()
+    let settings = |text: &str| {
+        let own = text.lines().filter(|line| !line.starts_with("#   "));
+        own.map(str::to_owned).collect::<Vec<_>>()
     };
     let first = proposal();
+    assert!(!first.contains("average = 2\n"), "another number of frames: {first}");
     program.plan(&first);
     let second = proposal();
-    assert_eq!(without_comments(&first), without_comments(&second), "{first}\n{second}");
+    assert_eq!(settings(&first), settings(&second), "{first}\n{second}");
     assert_eq!(
         (second.matches("# Proposed by").count(), second.matches("# Mine.").count()),
         (1, 1),
@@ -240,43 +246,75 @@ fn a_proposal_is_proposed_again_as_it_is() {
     );
 }
 
+/// So many delays that it tries them for seconds.
+const LONG: &str = "kind = \"sweep\"\n[sweep]\ndelay_us = { start = -1500, stop = 1500, count = 121 }\nexposure_us = [1000]\n";
+
 #[test]
 fn somebody_else_who_changes_the_viewfinder_is_told_of() {
     let mut program = Program::start(BRIGHT);
-    program.plan("kind = \"sweep\"\n[sweep]\ndelay_us = [0]\nexposure_us = [100, 1000]\n");
+    program.plan(LONG);
     let mut client = program.client();
     let mut command = program.command(&["--json", "expose", "plan.toml"]);
-    let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let (mut expose, mut output) = Process::with_output(command.stdout(Stdio::piped()).stderr(Stdio::null()));
     wait_for("a picture", || client.status().unwrap().viewfinder);
-    let wanted = ViewfinderParams { exposure_us: Some(321.0), ..ViewfinderParams::default() };
-    // Until it does not ask for others any more.
-    wait_for("the end of the viewfinder", || client.viewfinder(&wanted).is_err().then_some(()));
-    let output = child.wait_with_output().unwrap();
-    let said = String::from_utf8_lossy(&output.stdout).into_owned();
-    assert!(
-        !output.status.success() && said.contains("pictures of 321 us"),
-        "{said} {}",
-        String::from_utf8_lossy(&output.stderr)
-    );
+    let other = FinderPicture::Black;
+    // Once: what it asks for afterwards comes with this picture.
+    client.viewfinder(&ViewfinderParams { picture: Some(other), ..ViewfinderParams::default() }).unwrap();
+    assert!(!expose.wait().success());
+    let mut said = String::new();
+    output.read_to_string(&mut said).unwrap();
+    assert!(said.contains("but of black"), "{said}");
 }
 
-/// It was stopped for so long that the daemon ended its viewfinder, and somebody began a run meanwhile.
+/// It was stopped for so long that the daemon ended its viewfinder, and somebody began another one meanwhile.
 #[test]
-fn a_run_that_somebody_else_has_begun_goes_on() {
+fn a_viewfinder_that_somebody_else_has_begun_goes_on_as_it_is() {
     let mut program = Program::start(BRIGHT);
-    program.plan("kind = \"sweep\"\n[sweep]\ndelay_us = [0]\nexposure_us = [100, 1000]\n");
+    program.plan(LONG);
     let mut client = program.client();
     let mut expose =
         Process::start(program.command(&["expose", "plan.toml"]).stdout(Stdio::null()).stderr(Stdio::null()));
     wait_for("a picture", || client.status().unwrap().viewfinder);
     expose.signal(Signal::SIGSTOP);
-    wait_for("its end", || (client.status().unwrap().state == RunState::Idle).then_some(()));
-    let plan = RunParams { plan: "kind = \"viewfinder\"\n".into(), ..RunParams::default() };
-    let session = client.run(&plan).unwrap().session;
+    wait_for("its end", || client.status().unwrap().state.is_over().then_some(()));
+    let plan = "kind = \"viewfinder\"\n[viewfinder]\nexposure_us = 123\n".into();
+    let session = client.run(&RunParams { plan, ..RunParams::default() }).unwrap().session;
     wait_for("a picture", || client.status().unwrap().viewfinder);
     expose.signal(Signal::SIGCONT);
     assert!(!expose.wait().success());
+    let pictures = |client: &mut Client| client.status().unwrap().viewfinder.map_or(0, |seen| seen.pictures);
+    let before = pictures(&mut client);
+    wait_for("a picture", || (pictures(&mut client) > before).then_some(()));
     let status = client.status().unwrap();
     assert_eq!((status.state, status.session), (RunState::Running, Some(session)));
+    assert_eq!(status.viewfinder.unwrap().exposure_us, 123.0);
     client.cancel().unwrap();
+}
+
+/// A film has a single exposure, which is shortened with its delays.
+#[test]
+fn a_films_exposure_is_shortened() {
+    let program = Program::start(BRIGHT);
+    program.plan("kind = \"film\"\n[film]\ndelay_us = [-150, 0, 150]\nexposure_us = 400\n");
+    let (answer, exposure_us, rig) = proposed(&program);
+    let share = brute_force(&rig, 0.0, exposure_us).0;
+    assert!(exposure_us < 400.0 && share <= 1e-4, "{share}: {answer}");
+    let plan = raysweep_config::Plan::parse(answer["plan"].as_str().unwrap()).unwrap();
+    let raysweep_config::Procedure::Film(film) = &plan.procedure else { panic!("{plan:?}") };
+    assert_eq!(film.exposure_us, exposure_us);
+}
+
+/// A delay at which a shorter exposure misses the own row is moved with the exposure, so that it meets it again.
+#[test]
+fn delays_that_a_shorter_exposure_moves_are_tried_too() {
+    let folder = tempfile::tempdir().unwrap();
+    let program = Program::start(&with_indirect_light(BRIGHT, folder.path(), 0.95, 45, 0.1));
+    program.plan("kind = \"sweep\"\n[sweep]\ndelay_us = [0]\nexposure_us = [20, 300]\n[[sweep.extra]]\ndelay_us = [560]\nexposure_us = [1200]\n");
+    let (answer, exposure_us, rig) = proposed(&program);
+    let plan = raysweep_config::Plan::parse(answer["plan"].as_str().unwrap()).unwrap();
+    let raysweep_config::Procedure::Sweep(sweep) = &plan.procedure else { panic!("{plan:?}") };
+    let [delay_us] = sweep.extra[0].delay_us.values()[..] else { panic!("{sweep:?}") };
+    let shares = [560.0, delay_us].map(|delay_us| brute_force(&rig, delay_us, exposure_us).0);
+    println!("{exposure_us} us, extra delay {delay_us} us: {shares:?}");
+    assert!(exposure_us < 1200.0 && delay_us < 560.0 && shares[1] <= 1e-4, "{shares:?}: {answer}");
 }

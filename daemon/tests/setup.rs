@@ -166,6 +166,7 @@ fn wrong_answers_write_nothing_and_name_what_is_allowed() {
             "projector_rows = 0\nprojector_hz = 'slow'\ncamera = 'sim'\nvsync = 'wire'",
             "answers.toml: projector_rows = 0; allowed: 1 to 8192\nanswers.toml: projector_hz = \"slow\"; allowed: a number\nanswers.toml: vsync",
         ),
+        ("camera = 5\nkind = 'plane'", "camera = 5; allowed: a string"),
         ("camera = ", "answers.toml"),
         ("camera = 'sim'\nask_ports = ['132']", "ask_ports: 132: there is no such file"),
         ("camera = 'sim'\nask_ports = ['answers.toml']", "ask_ports: answers.toml: this is no serial port"),
@@ -175,7 +176,7 @@ fn wrong_answers_write_nothing_and_name_what_is_allowed() {
         ),
         (
             "camera = 'v4l2:/none'\nprojector = 'bench'\nvsync = 'bench'\nscene = '128'",
-            "scene = \"128\": scene \"128\": no such built-in scene; choose one of v-groove, ",
+            "scene = \"128\": no such scene; allowed: v-groove, ",
         ),
         ("camera = 'v4l2:/none'\npixel_format = 'Mono13'", "pixel_format = \"Mono13\": "),
         ("kind = 'dots'\ncamera = 'sim'\nmirror = 'optotune:/dev/null'", "laser_port = \"\": an Optotune"),

@@ -11,7 +11,7 @@ use crate::error::SimError;
 use crate::lens::Lens;
 use crate::line::VsyncLine;
 use crate::optics;
-use crate::scene::{Scene, SceneMotion, SceneSize};
+use crate::scene::{Scene, SceneMotion, SceneSize, is_file};
 use crate::sensor::{ImageSensor, Scale};
 use crate::shown::ShownOptics;
 use crate::truth::{PlaneTruth, Stated};
@@ -54,7 +54,7 @@ impl PlaneRig {
     /// When the scene cannot be read or a key is out of range; the message names the key.
     pub fn new(config: SimConfig, setup: PlaneSetup, folder: &Path) -> Result<Self, SimError> {
         check_ranges(&config)?;
-        let mut scenes = if config.scene.extension().is_some_and(|extension| extension == "npz") {
+        let mut scenes = if is_file(&config.scene) {
             vec![Scene::load(&folder.join(&config.scene))?]
         } else {
             let size = SceneSize { rows: config.scene_rows, columns: config.scene_columns };

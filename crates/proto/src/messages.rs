@@ -31,6 +31,11 @@ pub enum RunState {
 }
 
 impl RunState {
+    /// Whether no run is in progress: another one may begin.
+    pub const fn is_over(self) -> bool {
+        matches!(self, Self::Idle | Self::Faulted)
+    }
+
     /// Whether the daemon may go from this state to `next`.
     pub const fn may_become(self, next: RunState) -> bool {
         use RunState::{Armed, Draining, Faulted, Idle, Paused, Preparing, Running};

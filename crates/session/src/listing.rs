@@ -63,6 +63,13 @@ pub fn list(root: &Path) -> Result<Listing> {
     let is_draft = |dir: &PathBuf| dir.to_string_lossy().ends_with(durable::TEMPORARY_SUFFIX);
     for dir in dirs.into_iter().filter(|dir| !is_draft(dir)) {
         let Ok(session) = Session::open(&dir) else { continue };
+        // Its path could not be told to anybody in JSON.
+        if dir.to_str().is_none() {
+            let why = io::Error::new(io::ErrorKind::InvalidInput, "its name is not UTF-8: rename it");
+            let shown = PathBuf::from(dir.to_string_lossy().into_owned());
+            listing.unreadable.push((shown.clone(), Error::io("list", &shown)(why)));
+            continue;
+        }
         match session.state() {
             Ok(state) => listing.sessions.push(SessionSummary {
                 stored: state.stored_points(),
@@ -86,6 +93,9 @@ pub fn list(root: &Path) -> Result<Listing> {
 
 #[cfg(test)]
 mod tests {
+    use std::ffi::OsStr;
+    use std::os::unix::ffi::OsStrExt;
+
     use super::*;
     use crate::folder::tests::session;
 
@@ -96,11 +106,15 @@ mod tests {
         let (bad, _) = Session::create(root.path(), session("b"), "", "").unwrap();
         fs::write(bad.ledger_path(), "{}\n{}\n").unwrap();
         fs::create_dir(root.path().join("other")).unwrap();
+        let unnamed = root.path().join(OsStr::from_bytes(b"z\xff"));
+        fs::create_dir(&unnamed).unwrap();
+        fs::copy(kept.ledger_path(), unnamed.join("ledger.jsonl")).unwrap();
         let listing = list(root.path()).unwrap();
         assert_eq!(listing.sessions.len(), 1);
         let summary = &listing.sessions[0];
         assert_eq!((summary.dir.as_path(), summary.points, summary.stored), (kept.dir(), 4, 0));
-        assert_eq!(listing.unreadable.len(), 1);
+        assert_eq!(listing.unreadable.len(), 2);
+        assert!(listing.unreadable[1].1.to_string().contains("rename it"), "{:?}", listing.unreadable);
         assert_eq!(listing.unreadable[0].0, bad.dir());
     }
 }

@@ -4,6 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use ndarray::{Array2, Array3, Axis, concatenate, stack};
+use raysweep_config::plan::with_tables;
+use raysweep_config::{Plan, Procedure};
 use raysweep_core::Counts;
 use raysweep_processing::ProcessError;
 use raysweep_session::Session;
@@ -12,7 +14,7 @@ use serde::Serialize;
 
 use super::failure::CommandFailure;
 use super::picture_file;
-use super::sessions::{SessionView, calibration_of, flat};
+use super::sessions::{SessionView, calibration_of, flat, flat_text};
 use super::show::block;
 use super::thumbnails;
 
@@ -26,7 +28,7 @@ const PERCENTILE: f64 = 99.5;
 pub(super) struct Compared {
     /// What is damaged of the files that were compared, in each session.
     damage: [Vec<String>; 2],
-    /// Sentences about plan, rig file, calibration and software; empty if nothing differs.
+    /// Sentences about plan, rig file, calibration, software, operator and sample; empty if nothing differs.
     settings: Vec<String>,
     /// Points stored, of those planned.
     stored: [[usize; 2]; 2],
@@ -78,17 +80,26 @@ impl Compared {
                     products.insert(name.clone(), Difference::of(&first, &second));
                 }
                 // Arrays of more axes follow from the same stack.
-                (None, None) => {}
+                (None, None) if of_first.contains(name) && of_second.contains(name) => {}
                 _ => unlike.push(name.clone()),
             }
         }
         let only = |one: &SessionView, other: &SessionView| {
             one.warnings.iter().filter(|warning| !other.warnings.contains(warning)).cloned().collect()
         };
+        let mut settings = changes(a, b)?;
+        for (what, a, b) in
+            [("operator", &first.operator, &second.operator), ("sample", &first.sample, &second.sample)]
+        {
+            if a != b {
+                let said = |value: &Option<String>| value.clone().unwrap_or_else(|| "none".into());
+                settings.push(format!("{what}: {}, was {}", said(b), said(a)));
+            }
+        }
         Ok(Self {
             warnings: [only(&first, &second), only(&second, &first)],
             damage: [first.damage, second.damage],
-            settings: changes(a, b)?,
+            settings,
             picture: None,
             stored: [[first.stored, first.points], [second.stored, second.points]],
             counts: [first.counts, second.counts],
@@ -255,8 +266,9 @@ pub(super) fn changes(before: &Path, after: &Path) -> Result<Vec<String>, Comman
     let mut found = Vec::new();
     let open = |dir| Session::open(dir).map_err(ProcessError::from);
     let [first, second] = [open(before)?, open(after)?];
-    for file in ["plan.toml", "rig.toml"] {
-        let (a, b) = (flat(&first, file)?, flat(&second, file)?);
+    let plans = (flat_plan(&first)?, flat_plan(&second)?);
+    let rigs = (flat(&first, "rig.toml")?, flat(&second, "rig.toml")?);
+    for (file, (a, b)) in [("plan.toml", plans), ("rig.toml", rigs)] {
         let keys: BTreeSet<&String> = a.keys().chain(b.keys()).collect();
         for key in keys {
             match (a.get(key), b.get(key)) {
@@ -278,6 +290,19 @@ pub(super) fn changes(before: &Path, after: &Path) -> Result<Vec<String>, Comman
     let changed = others.into_iter().filter(|(_, a, b)| a != b);
     found.extend(changed.map(|(what, a, b)| format!("{what}: {b}, was {a}")));
     Ok(found)
+}
+
+/// The plan's keys, of a sweep or a film also those that it leaves to their defaults.
+fn flat_plan(session: &Session) -> Result<BTreeMap<String, String>, CommandFailure> {
+    let path = session.plan_path();
+    let text = session.read_text(&path).map_err(ProcessError::from)?;
+    let table = Plan::parse(&text).ok().and_then(|plan| match plan.procedure {
+        Procedure::Sweep(sweep) => Some(sweep.to_toml()),
+        Procedure::Film(film) => Some(film.to_toml()),
+        _ => None,
+    });
+    let whole = table.and_then(|table| with_tables(&text, &table).ok());
+    flat_text(&whole.unwrap_or(text), &path)
 }
 
 /// An image `[t, s, channels]` with one or three channels among a session's products.

@@ -1,7 +1,9 @@
 //! `raysweep doctor`: by the daemon, or without one.
 
+use std::io::ErrorKind;
 use std::path::Path;
 
+use raysweep_core::io_text;
 use raysweep_proto::{Client, ClientError, DoctorCheck, DoctorParams, DoctorReport, Grade};
 
 use super::exit::Exit;
@@ -10,8 +12,8 @@ use super::plan_file::read_plan;
 use super::printer::Printer;
 use super::show::counted;
 use crate::control::Control;
-use crate::doctor::examine;
-use crate::rig::AnyRig;
+use crate::doctor::{examine, user};
+use crate::rig::{AnyRig, RigError};
 use crate::runner::Runner;
 
 /// Has the daemon examine its rig.
@@ -35,9 +37,9 @@ pub(super) fn by_hand(
 ) -> Result<Exit, CommandFailure> {
     let text = plan.map(read_plan).transpose()?;
     let without_plan =
-        || -> Result<_, CommandFailure> { Ok(examine(&AnyRig::load(rig)?.into(), data, None, &|| true)) };
+        || -> Result<_, CommandFailure> { Ok(examine(&load(rig)?.into(), data, None, &|| true)) };
     let Some(plan) = plan else { return print(&without_plan()?, printer) };
-    let loaded = AnyRig::load(rig)?;
+    let loaded = load(rig)?;
     if matches!(loaded, AnyRig::Dots(_)) {
         let shown = plan.display();
         eprintln!(
@@ -56,6 +58,21 @@ pub(super) fn by_hand(
         Err(_) => without_plan()?,
     };
     print(&report, printer)
+}
+
+/// Loads a rig file, or says who may not read it.
+fn load(rig: &Path) -> Result<AnyRig, RigError> {
+    AnyRig::load(rig).map_err(|error| match error {
+        RigError::Read { path, source } if source.kind() == ErrorKind::PermissionDenied => {
+            RigError::Config(format!(
+                "cannot read {}: {}: let `{}`, who asks, read the file and its folder",
+                path.display(),
+                io_text(&source),
+                user()
+            ))
+        }
+        other => other,
+    })
 }
 
 fn of_plan(error: ClientError, plan: Option<&Path>, text: Option<&str>) -> CommandFailure {

@@ -53,7 +53,7 @@ use self::printer::{Printer, printable};
 use self::sessions::SessionView;
 use self::setup::{SetupFiles, setup};
 use self::view::EventView;
-use self::viewfinder::{Wanted, change_or_plan, changed};
+use self::viewfinder::{Wanted, change_or_plan, runs};
 use raysweep_processing::calibration::{CalibrationHeader, current_in};
 use raysweep_processing::{
     Asked, ExportFormat, ExportScope, ProcessError, copy_acquired, export, export_as, process_asked,
@@ -122,7 +122,7 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             Wanted::Plan(path, text) => {
                 return run(&socket, printer, &path, &text, arguments.about);
             }
-            Wanted::Changed => return changed(printer),
+            Wanted::Nothing { is_changed } => return runs(is_changed, printer),
         },
         Command::Calibration(command) => return calibration::calibration(&socket, command, printer),
         Command::Resume { session, detach, .. } => {
@@ -226,12 +226,12 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             let (mut told, mut said) = match for_good {
                 true => {
                     session.delete_for_good().map_err(ProcessError::from)?;
-                    (json!({ "deleted": dir }), format!("{} is deleted", dir.display()))
+                    (json!({ "deleted": dir.to_string_lossy() }), format!("{} is deleted", dir.display()))
                 }
                 false => {
                     let to = session.trash().map_err(ProcessError::from)?;
                     let said = format!("moved to {0}; `raysweep restore {0}` brings it back", to.display());
-                    (json!({ "moved_to": to }), said)
+                    (json!({ "moved_to": to.to_string_lossy() }), said)
                 }
             };
             told["stays_in_use"] = json!(stays_in_use);
@@ -243,7 +243,9 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
         Command::Restore { session } => {
             let trashed = Session::open(&trashed_folder_of(session, &socket)?);
             let to = trashed.and_then(|session| session.restore()).map_err(ProcessError::from)?;
-            printer.print(&json!({ "moved_to": to }), |_| format!("moved to {}", to.display()))?;
+            printer.print(&json!({ "moved_to": to.to_string_lossy() }), |_| {
+                format!("moved to {}", to.display())
+            })?;
         }
         Command::Process { session, to, products, only, memory, accept_damage, accept_edits } => {
             let session = folder_of(session, &socket)?;
@@ -262,7 +264,7 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
                     }
                 })?;
             let value = json!({
-                "report": made.report, "stored": made.stored, "points": made.points, "problems": made.problems,
+                "report": made.report.to_string_lossy(), "stored": made.stored, "points": made.points, "problems": made.problems,
             });
             printer.print(&value, |_| show::processed(&made))?;
         }
@@ -293,7 +295,8 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             let state = Session::open(&session).and_then(|session| session.state()).ok();
             let unended = state.filter(|state| state.end.is_none());
             let unended = unended.map(|state| (state.stored_points(), state.session.shape.points()));
-            let value = json!({ "folder": to, "files": files, "is_over": unended.is_none() });
+            let value =
+                json!({ "folder": to.to_string_lossy(), "files": files, "is_over": unended.is_none() });
             printer.print(&value, |_| {
                 let copied = format!("{files} files copied to {}", to.display());
                 match unended {

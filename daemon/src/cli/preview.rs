@@ -6,7 +6,7 @@ use std::thread;
 use std::time::Duration;
 
 use ndarray::{Array2, Axis, Ix2, concatenate};
-use raysweep_proto::{Client, RunState};
+use raysweep_proto::Client;
 use raysweep_session::report::{Picture, ToneMap};
 use serde_json::{Value, json};
 
@@ -39,7 +39,7 @@ pub(super) fn preview(
     let (mut drawn, mut was_under_way) = (None, false);
     loop {
         // Also detects that the daemon is gone: a removed file never changes.
-        let is_under_way = !matches!(client.status()?.state, RunState::Idle | RunState::Faulted);
+        let is_under_way = !client.status()?.state.is_over();
         let newest = newest(&reader)?;
         let is_none = newest.is_none();
         let mut is_last = was_under_way && !is_under_way;

@@ -22,11 +22,27 @@ impl Printer {
         text: impl FnOnce(&T) -> String,
     ) -> Result<(), CommandFailure> {
         let line = match self.json {
-            true => serde_json::to_string(result).map_err(io::Error::from).map_err(CommandFailure::Output)?,
+            true => json_line(result).map_err(CommandFailure::Output)?,
             false => printable(&text(result)).into_owned(),
         };
         writeln!(io::stdout(), "{line}").map_err(CommandFailure::Output)
     }
+}
+
+/// A value as a line of JSON, in which what controls a terminal is escaped: JSON itself escapes only some of it.
+pub(super) fn json_line(value: &impl Serialize) -> io::Result<String> {
+    let line = serde_json::to_string(value)?;
+    Ok(match line.contains(is_unprintable) {
+        true => line.chars().fold(String::with_capacity(line.len()), |mut shown, letter| {
+            match is_unprintable(letter) {
+                // All of these have at most four hexadecimal digits.
+                true => shown.extend(format!("\\u{:04x}", u32::from(letter)).chars()),
+                false => shown.push(letter),
+            }
+            shown
+        }),
+        false => line,
+    })
 }
 
 /// A text as it may be shown on a terminal. What others wrote into a session, a file or a device could otherwise move the
@@ -63,5 +79,9 @@ mod tests {
         assert_eq!(printable("a\tb\nµ → Ω"), "a\tb\nµ → Ω");
         assert_eq!(printable("\u{1b}[2J\r\u{9b}1m"), "\\u{1b}[2J\\u{d}\\u{9b}1m");
         assert_eq!(printable("\u{202e}txt.exe\u{2066}"), "\\u{202e}txt.exe\\u{2066}");
+        let hostile = "a\u{1b}\u{9b}\u{202e}b";
+        let line = json_line(&hostile).unwrap();
+        assert_eq!(line, "\"a\\u001b\\u009b\\u202eb\"");
+        assert_eq!(serde_json::from_str::<String>(&line).unwrap(), hostile);
     }
 }

@@ -45,7 +45,7 @@ pub(super) struct SessionFilter {
     #[arg(long, value_name = "DATE", value_parser = day)]
     until: Option<Date>,
     /// Only those in this state
-    #[arg(long, value_name = "STATE", value_parser = ["complete", "cancelled", "faulted", "unfinished", "unreadable"])]
+    #[arg(long, value_name = "STATE", value_parser = ["complete", "cancelled", "faulted", "running", "unfinished", "unreadable"])]
     state: Option<String>,
     /// Only those of this kind; without it, all but viewfinders, which hold no images
     #[arg(long, value_name = "KIND", value_parser = KINDS)]
@@ -97,8 +97,8 @@ pub(super) struct SessionView {
     name: String,
     kind: String,
     created: Timestamp,
-    operator: Option<String>,
-    sample: Option<String>,
+    pub operator: Option<String>,
+    pub sample: Option<String>,
     note: Option<String>,
     tags: Vec<String>,
     software: String,
@@ -280,6 +280,13 @@ pub(super) fn run_again(dir: &Path) -> Result<RunParams, CommandFailure> {
 
 /// The values of a TOML file of a session by their keys, such as `sweep.delay_us`.
 pub(super) fn flat(session: &Session, file: &str) -> Result<BTreeMap<String, String>, CommandFailure> {
+    let path = session.dir().join(file);
+    let text = session.read_text(&path).map_err(ProcessError::from)?;
+    flat_text(&text, &path)
+}
+
+/// The same of a text that stands for the file.
+pub(super) fn flat_text(text: &str, path: &Path) -> Result<BTreeMap<String, String>, CommandFailure> {
     fn walk(prefix: &str, value: &toml::Value, found: &mut BTreeMap<String, String>) {
         let below = |key: &str| if prefix.is_empty() { key.to_owned() } else { format!("{prefix}.{key}") };
         match value {
@@ -294,9 +301,7 @@ pub(super) fn flat(session: &Session, file: &str) -> Result<BTreeMap<String, Str
             value => drop(found.insert(prefix.to_owned(), value.to_string())),
         }
     }
-    let path = session.dir().join(file);
-    let text = session.read_text(&path).map_err(ProcessError::from)?;
-    let table: toml::Table = toml::from_str(&text).map_err(|error| {
+    let table: toml::Table = toml::from_str(text).map_err(|error| {
         CommandFailure::Sessions(format!("{} cannot be read: {}", path.display(), error.message()))
     })?;
     let mut found = BTreeMap::new();

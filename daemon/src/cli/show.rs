@@ -27,7 +27,7 @@ pub(super) fn status(status: &Status) -> String {
     if let Some(session) = &status.session {
         rows.push(("session", session.display().to_string()));
     }
-    let is_over = matches!(status.state, RunState::Idle | RunState::Faulted);
+    let is_over = status.state.is_over();
     rows.extend(status.ended.iter().map(|ended| ("ended", ended.clone())));
     if let Some(progress) = &status.progress {
         let (stored, planned) = (progress.points_stored, progress.points_planned);
@@ -261,7 +261,7 @@ pub(super) fn accuracy(
     RigAccuracy { calibrated, latency_us, edge_us, place_rows, .. }: &RigAccuracy,
 ) -> String {
     let source = match calibrated {
-        true => "as calibrated",
+        true => "as calibrated; how late light comes in a run, the run finds itself",
         false => {
             "assumed, because the rig is not calibrated: errors may be many times larger; run `raysweep calibrate`"
         }

@@ -8,7 +8,7 @@ use raysweep_core::{PointUnderWay, VsyncStats};
 use raysweep_proto::{Event, FilmEstimate, Progress, RunState, ViewfinderValues};
 
 use super::finder_text;
-use super::printer::{Printer, printable};
+use super::printer::{Printer, json_line, printable};
 use super::show::{self, Ending};
 
 /// Interval between progress lines where no bar can be drawn.
@@ -68,7 +68,7 @@ impl EventView {
     /// Displays an event; the result of a run goes to standard output, everything else to standard error.
     pub fn show(&mut self, event: &Event) -> io::Result<()> {
         if let Place::Json = self.place {
-            return writeln!(io::stdout(), "{}", serde_json::to_string(event)?);
+            return writeln!(io::stdout(), "{}", json_line(event)?);
         }
         match event {
             // The result of the run is displayed in a moment.

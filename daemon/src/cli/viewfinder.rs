@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use raysweep_proto::{Client, ClientError, ErrorCode, RpcError, RunState, ViewfinderParams};
+use raysweep_proto::{Client, ClientError, ErrorCode, RpcError, ViewfinderParams};
 
 use super::arguments::ViewfinderArguments;
 use super::exit::Exit;
@@ -25,11 +25,13 @@ impl ViewfinderArguments {
     }
 }
 
-/// What remains to be done: a viewfinder to be started with this plan, or nothing, because one runs and was changed.
+/// What remains to be done: a viewfinder to be started with this plan, or nothing, because one runs.
 pub(super) enum Wanted {
     /// The path that messages name, and the text.
     Plan(PathBuf, String),
-    Changed,
+    Nothing {
+        is_changed: bool,
+    },
 }
 
 /// Changes the viewfinder that runs; otherwise returns the plan of one to start.
@@ -39,8 +41,7 @@ pub(super) fn change_or_plan(
 ) -> Result<Wanted, CommandFailure> {
     let mut client = Client::connect(socket)?;
     let status = client.status()?;
-    let is_over = matches!(status.state, RunState::Idle | RunState::Faulted);
-    if let (false, None) = (is_over, &arguments.plan) {
+    if let (false, None) = (status.state.is_over(), &arguments.plan) {
         let ViewfinderArguments { picture, trigger, region, exposure_us, board, seconds, .. } = *arguments;
         let is_of_another = board || seconds.is_some() || trigger.is_some();
         if is_of_another && status.viewfinder.is_some() {
@@ -51,7 +52,9 @@ pub(super) fn change_or_plan(
         let wanted = ViewfinderParams { picture, region, exposure_us, delay_us: None };
         match (!is_of_another).then(|| client.viewfinder(&wanted)) {
             None => {}
-            Some(Ok(())) => return Ok(Wanted::Changed),
+            Some(Ok(())) => {
+                return Ok(Wanted::Nothing { is_changed: wanted != ViewfinderParams::default() });
+            }
             Some(Err(ClientError::Rpc(error))) if error.name() == Some(ErrorCode::NotRunning) => {}
             Some(Err(error)) => return Err(error.into()),
         }
@@ -62,9 +65,12 @@ pub(super) fn change_or_plan(
     }
 }
 
-/// Says that the running viewfinder was changed.
-pub(super) fn changed(printer: Printer) -> Result<Exit, CommandFailure> {
-    printer.print(&raysweep_proto::Empty {}, |_| "the running viewfinder was changed".into())?;
+/// Says that one runs, and whether it was changed.
+pub(super) fn runs(is_changed: bool, printer: Printer) -> Result<Exit, CommandFailure> {
+    printer.print(&raysweep_proto::Empty {}, |_| match is_changed {
+        true => "the running viewfinder was changed".into(),
+        false => "a viewfinder runs already: --picture, --region and --exposure-us change it, `raysweep cancel` ends it".into(),
+    })?;
     Ok(Exit::Done)
 }
 

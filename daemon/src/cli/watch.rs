@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use raysweep_proto::{Client, ClientError, ErrorCode, Event, RpcError, RunState, Status, Subscription};
+use raysweep_proto::{Client, ClientError, ErrorCode, Event, RpcError, Status, Subscription};
 
 use super::exit::Exit;
 use super::failure::CommandFailure;
@@ -127,7 +127,7 @@ fn under_way(status: &Status) -> Option<PathBuf> {
 }
 
 fn is_over(status: &Status) -> bool {
-    matches!(status.state, RunState::Idle | RunState::Faulted)
+    status.state.is_over()
 }
 
 /// What became of a run whose end nobody saw.

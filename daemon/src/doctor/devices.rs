@@ -265,6 +265,10 @@ fn examine_frames(checkup: &mut Checkup, rig: &Rig, frames: &SeenFrames, has_edg
         return checkup.failure(FRAMES, format!("{taken} arrived, then: {error}"), remedy);
     }
     let is_whole = frames.series.iter().all(|series| !series.stamps.is_empty());
+    if !is_whole && frames.is_cut_short {
+        let found = format!("{taken} arrived until the examination ended, too few to judge the camera by");
+        return checkup.failure(FRAMES, found, "`raysweep doctor` again");
+    }
     let lost = losses(&frames.series);
     let text = lost.iter().map(|(cause, frames)| format!("{frames} lost ({cause})")).collect::<Vec<_>>();
     if !is_whole && lost.is_empty() {

@@ -19,7 +19,7 @@ const FAST_CLOCKS: [&str; 4] = ["tsc", "kvm-clock", "arch_sys_counter", "hyperv_
 const LITTLE_MEMORY_BYTES: u64 = 1 << 30;
 
 /// Name of the user whose permissions count.
-pub(super) fn user() -> String {
+pub fn user() -> String {
     let uid = geteuid();
     User::from_uid(uid).ok().flatten().map_or_else(|| format!("user {uid}"), |user| user.name)
 }

@@ -16,6 +16,8 @@ use raysweep_proto::DoctorReport;
 use self::checkup::Checkup;
 use crate::rig::SharedRig;
 
+pub use self::host::user;
+
 /// What a plan writes.
 #[derive(Debug, Clone, Copy)]
 pub struct PlanNeeds {
@@ -36,6 +38,11 @@ pub fn examine(
     let mut checkup = Checkup::default();
     host::examine(&mut checkup);
     storage::examine(&mut checkup, data, needs);
+    if let SharedRig::Plane(rig) = rig
+        && !rig.file.calibration.is_overridden
+    {
+        storage::examine_calibration(&mut checkup, data);
+    }
     nodes::examine(&mut checkup, &nodes::of(rig));
     network::examine(&mut checkup, rig);
     if go_on() {

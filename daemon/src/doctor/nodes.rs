@@ -93,7 +93,7 @@ fn examine_node(checkup: &mut Checkup, NamedNode { key, path, is_input }: &Named
         Ok(()) => checkup.ok(key, format!("{shown} is there, and {} may use it", user())),
         Err(Errno::EACCES) => {
             let found = format!("{shown}: {} may not use it", user());
-            checkup.failure(key, found, grant(path, metadata.gid(), metadata.mode()));
+            checkup.failure(key, found, grant(path, metadata.gid(), metadata.mode(), *is_input));
         }
         Err(errno) => checkup.failure(key, format!("{shown}: {errno}"), list_of(path)),
     }
@@ -114,16 +114,16 @@ fn list_of(path: &Path) -> String {
 }
 
 /// How a user gets the permission of a node's group, if that has one.
-fn grant(path: &Path, gid: u32, mode: u32) -> String {
-    const GROUP_MAY: u32 = 0o060;
+fn grant(path: &Path, gid: u32, mode: u32, is_input: bool) -> String {
+    let (group_may, rights) = if is_input { (0o040, "r") } else { (0o060, "rw") };
     let group = Group::from_gid(Gid::from_raw(gid)).ok().flatten().map(|group| group.name);
-    match group.filter(|name| name != "root" && mode & GROUP_MAY == GROUP_MAY) {
+    match group.filter(|name| name != "root" && mode & group_may == group_may) {
         Some(group) => format!(
             "`usermod -aG {group} {0}` as root, then log in again, or `systemctl restart raysweepd` for the service",
             user()
         ),
         None => format!(
-            "install the package's udev rules and plug it in again, or `chgrp raysweep {0} && chmod g+rw {0}` as root until it is unplugged",
+            "install the package's udev rules and plug it in again, or `chgrp raysweep {0} && chmod g+{rights} {0}` as root until it is unplugged",
             path.display()
         ),
     }
@@ -173,9 +173,13 @@ mod tests {
 
     #[test]
     fn the_group_of_a_node_is_told_to_who_is_not_in_it() {
-        let dialout = Group::from_name("dialout").unwrap().unwrap();
-        let remedy = grant(Path::new("/dev/ttyUSB0"), dialout.gid.as_raw(), 0o660);
-        assert!(remedy.contains("usermod -aG dialout"), "{remedy}");
-        assert!(grant(Path::new("/dev/ttyUSB0"), dialout.gid.as_raw(), 0o600).contains("udev"));
+        // The group that every Unix has after root's.
+        let group = (1..1000).find_map(|gid| Group::from_gid(Gid::from_raw(gid)).unwrap()).unwrap();
+        let told = |mode, is_input| grant(Path::new("/dev/ttyUSB0"), group.gid.as_raw(), mode, is_input);
+        let remedy = told(0o660, false);
+        assert!(remedy.contains(&format!("usermod -aG {}", group.name)), "{remedy}");
+        assert!(told(0o600, false).contains("udev") && told(0o600, false).contains("g+rw"));
+        assert!(told(0o640, true).contains("usermod") && !told(0o640, false).contains("usermod"));
+        assert!(told(0o600, true).contains("chmod g+r /dev"), "{}", told(0o600, true));
     }
 }

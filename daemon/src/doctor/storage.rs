@@ -8,6 +8,7 @@ use std::time::Instant;
 
 use nix::unistd::{Uid, User};
 use raysweep_core::{Size, io_text};
+use raysweep_processing::calibration::{CalibrationHeader, current_in};
 use raysweep_session::durable;
 
 use super::PlanNeeds;
@@ -21,6 +22,7 @@ const LITTLE_ROOM_BYTES: u64 = 1 << 30;
 /// A disk that is this much faster than a plan needs keeps up while other programs write.
 const RESERVE: f64 = 2.0;
 
+const CALIBRATION: &str = "calibration";
 const OLD_SESSIONS: &str = "`raysweep sessions` lists sessions: move old ones to another disk, or delete them by `raysweep trash --for-good`";
 
 pub(super) fn examine(checkup: &mut Checkup, data: &Path, needs: Option<PlanNeeds>) {
@@ -32,6 +34,10 @@ pub(super) fn examine(checkup: &mut Checkup, data: &Path, needs: Option<PlanNeed
         // It may also be out of sight of who looks.
         Ok(true) | Err(_) => data.display().to_string(),
     };
+    if data.is_symlink() && !data.exists() {
+        let found = format!("{} is a symbolic link to what is not there", data.display());
+        return checkup.failure(FOLDER, found, "make the folder that it points to, or remove the link");
+    }
     let speed = match speed(present) {
         Ok(bytes_per_s) => bytes_per_s,
         Err(error) => {
@@ -68,6 +74,22 @@ fn writable(folder: &Path) -> String {
             format!("{own}, or ask as its owner: `runuser -u {name} -- raysweep doctor` as root")
         }
         None => own,
+    }
+}
+
+/// Whether the calibration can be read that a plane rig's runs use.
+pub(super) fn examine_calibration(checkup: &mut Checkup, data: &Path) {
+    let folder = current_in(data);
+    match CalibrationHeader::read(&folder) {
+        Ok(Some(header)) => {
+            checkup.ok(CALIBRATION, format!("of {}", header.made.strftime("%Y-%m-%d %H:%M UTC")))
+        }
+        Ok(None) => {}
+        Err(why) => {
+            let (user, folder) = (super::host::user(), folder.display());
+            let remedy = format!("let `{user}` read {folder}, or `raysweep calibrate` again");
+            checkup.failure(CALIBRATION, format!("cannot be used: {why}"), remedy);
+        }
     }
 }
 
@@ -129,6 +151,24 @@ mod tests {
         assert_eq!(grades, [Grade::Ok, Grade::Ok, Grade::Warning, Grade::Warning]);
         assert!(checkup.checks()[0].found.contains("does not exist yet"), "{:?}", checkup.checks());
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn a_link_to_nothing_and_a_calibration_that_cannot_be_read_are_failures() {
+        let folder = tempfile::tempdir().unwrap();
+        let link = folder.path().join("link");
+        std::os::unix::fs::symlink("nowhere", &link).unwrap();
+        let damaged = folder.path().join("data");
+        fs::create_dir_all(current_in(&damaged)).unwrap();
+        fs::write(current_in(&damaged).join("calibration.toml"), "made = ").unwrap();
+        let mut checkup = Checkup::default();
+        examine(&mut checkup, &link, None);
+        examine_calibration(&mut checkup, &damaged);
+        examine_calibration(&mut checkup, folder.path());
+        let [of_link, of_calibration] = checkup.checks() else { panic!("one check each, none without one") };
+        assert_eq!([of_link.grade, of_calibration.grade], [Grade::Failure; 2]);
+        assert!(of_link.found.contains("symbolic link"), "{of_link:?}");
+        assert!(of_calibration.found.contains("cannot be used"), "{of_calibration:?}");
     }
 
     #[test]

@@ -52,6 +52,8 @@ pub(super) struct FrameSeries {
 #[derive(Debug, Default)]
 pub(super) struct SeenFrames {
     pub series: Vec<FrameSeries>,
+    /// Whether it was told to end before all had come.
+    pub is_cut_short: bool,
     pub error: Option<DeviceError>,
 }
 
@@ -133,6 +135,7 @@ fn watch_line(
 fn take(camera: &mut dyn Camera, settings: &[CameraSettings], may_go_on: &dyn Fn() -> bool) -> SeenFrames {
     let mut seen = SeenFrames::default();
     seen.error = take_into(&mut seen.series, camera, settings, may_go_on).err();
+    seen.is_cut_short = !may_go_on();
     if let Err(error) = camera.disarm() {
         seen.error.get_or_insert(error);
     }

@@ -8,20 +8,23 @@ use raysweep_config::rig::plane::CameraDriver;
 use raysweep_core::{Camera, Clock, DeviceError, Pattern, Projector, Shown, Subject, Vsync};
 use raysweep_drivers::projector::external::External;
 use raysweep_sim::bench::{RemoteProjector, RemoteVsync, remote_subject};
-use raysweep_sim::scene::{BUILTIN_NAMES, MOVING_NAMES, SceneError};
+use raysweep_sim::scene::{BUILTIN_NAMES, MOVING_NAMES, is_file};
 use raysweep_sim::{PlaneDevices, PlaneRig, PlaneSetup, SimError, SubjectSwitch};
 
 use super::{Rig, RigError, Stand};
 
-/// Whether a scene can be what `sim.scene` names: a built-in scene, or a file, which is not looked for.
+/// Whether there is a scene of this name: one that is built in, or a file, relative to `folder`.
 ///
 /// # Errors
-/// [`SceneError::UnknownName`], which lists the built-in scenes.
-pub fn check_scene(name: &str) -> Result<(), SceneError> {
-    let mut known = BUILTIN_NAMES.iter().chain(&MOVING_NAMES);
-    match known.any(|known| *known == name) || name.ends_with(".npz") {
+/// With the names that are allowed.
+pub fn check_scene(name: &str, folder: &Path) -> Result<(), String> {
+    let known = BUILTIN_NAMES.iter().chain(&MOVING_NAMES).copied().collect::<Vec<_>>();
+    match known.contains(&name) || (is_file(Path::new(name)) && folder.join(name).is_file()) {
         true => Ok(()),
-        false => Err(SceneError::UnknownName { name: name.to_owned() }),
+        false => Err(format!(
+            "no such scene; allowed: {}, or a file that ends in .npz, relative to the rig file",
+            known.join(", ")
+        )),
     }
 }
 

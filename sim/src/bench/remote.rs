@@ -13,8 +13,9 @@ use super::{MAX_LINE, Reply, Request, Truth};
 use crate::gige::Faults;
 use crate::subject::SubjectSwitch;
 
-/// Longest wait for an answer: a new pattern takes the bench a moment to compute.
-const ANSWER: Duration = Duration::from_secs(10);
+/// Longest wait for an answer: the first pattern that varies along rows takes the bench seconds to compute, on a busy machine
+/// many.
+const ANSWER: Duration = Duration::from_secs(60);
 
 /// A connection to the bench.
 struct Connection {

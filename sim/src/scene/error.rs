@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use ndarray_npy::{ReadNpzError, WriteNpzError};
+use raysweep_core::io_text;
 
 use super::names::{BUILTIN_NAMES, MOVING_NAMES};
 use super::size::{MAX_ENTRIES, MIN_SIDE, Window};
@@ -44,7 +45,7 @@ pub enum SceneError {
         keys: usize,
     },
     /// The file cannot be opened.
-    #[error("scene file {}: cannot be opened; check the path and its permissions", path.display())]
+    #[error("scene file {}: {}; check the path, and that the program's user may read it", path.display(), io_text(source))]
     Open {
         /// The file.
         path: PathBuf,

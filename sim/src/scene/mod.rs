@@ -36,7 +36,7 @@ use rayon::prelude::*;
 
 pub use error::SceneError;
 pub use motion::SceneMotion;
-pub use names::{BUILTIN_NAMES, MOVING_NAMES};
+pub use names::{BUILTIN_NAMES, MOVING_NAMES, is_file};
 use object::Panel;
 use projector::ColumnPattern;
 pub use size::{MAX_ENTRIES, MIN_SIDE, SceneSize, Window};

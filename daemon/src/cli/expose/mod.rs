@@ -10,8 +10,8 @@ use raysweep_config::{Plan, Procedure};
 use raysweep_proto::{CheckReport, Client};
 use serde_json::json;
 
-use self::plan::{MAX_AVERAGE, averaged, delays, limited, noise_ratio};
-use self::trial::{MAX_SATURATED, Trial, Tried, in_hundredths};
+use self::plan::{BALANCED, MAX_AVERAGE, averaged, limited, noise_ratio, plan_exposures};
+use self::trial::{MAX_SATURATED, PlanExposures, Trial, Tried, in_hundredths};
 use super::exit::Exit;
 use super::failure::CommandFailure;
 use super::plan_file::read_plan;
@@ -21,18 +21,20 @@ use super::show;
 /// A scene that could be this much brighter is worth opening the aperture for, and a board that is as much too bright is
 /// worth closing it.
 const WORTHWHILE: f64 = 1.1;
-/// So many steps are tried.
+/// Frames per point are balanced in so many steps at most, each of which is a check; two are the rule.
 const STEPS: usize = 4;
-/// What begins the comments of a proposal, and each of their further lines: those of an earlier one are left out.
+/// What begins and ends the comments of a proposal, and what each between them begins with: those of an earlier one are left
+/// out.
 const PROPOSED: &str = "# Proposed by `raysweep expose`:";
 const REMARK: &str = "#   ";
+const END: &str = "# End of the proposal.";
 
 /// Tries exposures for a plan, and prints what it proposes.
 pub(super) fn expose(socket: &Path, path: &Path, printer: Printer) -> Result<Exit, CommandFailure> {
-    let text = without_remarks(&read_plan(path)?);
-    let refused = |error| CommandFailure::of_plan(error, path, &text);
+    let text = read_plan(path)?;
     let mut client = Client::connect(socket)?;
-    let foreseen = client.check(&text).map_err(refused)?;
+    let foreseen = client.check(&text).map_err(|error| CommandFailure::of_plan(error, path, &text))?;
+    let text = without_remarks(&text);
     // Settings that the plan leaves to the calibration are stated in what is proposed.
     let text = match foreseen.settings {
         Some(table) => {
@@ -40,13 +42,13 @@ pub(super) fn expose(socket: &Path, path: &Path, printer: Printer) -> Result<Exi
         }
         None => text,
     };
-    let asked = Plan::parse(&text).map(|plan| delays(&plan.procedure)).unwrap_or_default();
-    let Some(longest_us) = asked.iter().map(|delay| delay.longest_us).reduce(f64::max) else {
+    let Some(exposures) = Plan::parse(&text).ok().and_then(|plan| plan_exposures(&plan.procedure)) else {
         let message = "the plan has no exposures to choose: give a plan of kind \"sweep\" or \"film\"";
         return Err(CommandFailure::Exposure(message.into()));
     };
-    let tried = Trial::begin(socket, foreseen.white_dn, printer)?.longest(longest_us, &asked)?;
-    let mut plan = limited(&text, tried.exposure_us)?;
+    let mut trial = Trial::begin(socket, foreseen.white_dn, printer)?;
+    let (tried, mut plan) = fitted(&mut trial, text, &exposures)?;
+    drop(trial);
     let mut check =
         |plan: &str| client.check(plan).map_err(|error| CommandFailure::of_plan(error, path, plan));
     let mut report = check(&plan)?;
@@ -56,16 +58,37 @@ pub(super) fn expose(socket: &Path, path: &Path, printer: Printer) -> Result<Exi
             None => break,
         }
     }
-    let proposal = Proposed { tried, longest_us, report, plan };
+    let proposal = Proposed { tried, longest_us: exposures.longest_us, report, plan };
     printer.print(&proposal.value(), |_| proposal.text())?;
     Ok(Exit::Done)
 }
 
+/// The plan without exposures that saturate too much, and what was found of it.
+fn fitted(
+    trial: &mut Trial,
+    mut text: String,
+    exposures: &PlanExposures,
+) -> Result<(Tried, String), CommandFailure> {
+    let mut tried = trial.longest(exposures)?;
+    loop {
+        let plan = limited(&text, tried.exposure_us)?;
+        let shorter = Plan::parse(&plan).ok().and_then(|plan| plan_exposures(&plan.procedure));
+        // A shorter exposure moves delays, at which nothing has been tried yet.
+        let Some(shorter) = shorter.filter(|_| plan != text) else { return Ok((tried, plan)) };
+        let shortest_us = exposures.shortest_us.min(shorter.shortest_us);
+        tried = trial.longest(&PlanExposures { shortest_us, ..shorter })?;
+        text = plan;
+    }
+}
+
 /// A plan's text without the comments of an earlier proposal.
 fn without_remarks(text: &str) -> String {
-    let Some((before, after)) = text.split_once(&format!("{PROPOSED}\n")) else { return text.to_owned() };
-    let lines = after.split_inclusive('\n').skip_while(|line| line.starts_with(REMARK));
-    before.chars().chain(lines.flat_map(str::chars)).collect()
+    let lines: Vec<&str> = text.split_inclusive('\n').collect();
+    let find = |wanted: &str| lines.iter().position(|line| line.trim_end() == wanted);
+    match find(PROPOSED).zip(find(END)) {
+        Some((first, last)) if first < last => [&lines[..first], &lines[last + 1..]].concat().concat(),
+        _ => text.to_owned(),
+    }
 }
 
 /// What is proposed.
@@ -92,11 +115,15 @@ impl Proposed {
 
     /// Frames per point, if they are counted by what is foreseen.
     fn average(&self) -> Option<u32> {
-        noise_ratio(&self.report.advice.as_ref()?.expected)?;
+        self.noise_ratio()?;
         match Plan::parse(&self.plan).ok()?.procedure {
             Procedure::Sweep(sweep) => Some(sweep.average),
             _ => None,
         }
+    }
+
+    fn noise_ratio(&self) -> Option<f64> {
+        noise_ratio(&self.report.advice.as_ref()?.expected)
     }
 
     /// What the camera's gain is to be multiplied by, unless the aperture is opened by as much.
@@ -145,15 +172,14 @@ impl Proposed {
             remarks.push(format!("longer ones, up to {longest_us} us, saturate more and are shortened"));
         }
         remarks.push(self.gain());
-        if let Some(average) = self.average() {
-            remarks.push(match f64::from(average) < MAX_AVERAGE {
-                true => format!(
-                    "average = {average}: noise is then about as large as what averaging does not remove"
-                ),
-                false => format!(
-                    "average = {average}, the most that is proposed; more would lower the noise further"
-                ),
-            });
+        if let Some((average, ratio)) = self.average().zip(self.noise_ratio()) {
+            let most = match ratio > BALANCED && f64::from(average) >= MAX_AVERAGE {
+                true => format!("; more than {MAX_AVERAGE} frames are not proposed"),
+                false => String::new(),
+            };
+            remarks.push(format!(
+                "average = {average}: noise is {ratio:.2} times as large as what averaging does not remove{most}"
+            ));
         }
         remarks.push(format!("{:.2} s of light", report.light_s));
         if let Some(advice) = &report.advice {
@@ -162,7 +188,7 @@ impl Proposed {
         }
         remarks.extend(report.warnings.iter().map(|warning| format!("warning: {warning}")));
         let remarks: String = remarks.into_iter().map(|remark| format!("{REMARK}{remark}\n")).collect();
-        format!("{PROPOSED}\n{remarks}{}", plan.trim_end())
+        format!("{PROPOSED}\n{remarks}{END}\n{}", plan.trim_end())
     }
 }
 
@@ -198,7 +224,11 @@ mod tests {
     #[test]
     fn remarks_of_an_earlier_proposal_are_left_out() {
         let plan = "# Mine.\nkind = \"sweep\"\n";
-        assert_eq!(without_remarks(&format!("{PROPOSED}\n{REMARK}this\n{REMARK}and that\n{plan}")), plan);
-        assert_eq!(without_remarks(plan), plan);
+        let block = format!("{PROPOSED}\n{REMARK}this\n{REMARK}and that\n{END}\n");
+        assert_eq!(without_remarks(&format!("{block}#   My own.\n{plan}")), format!("#   My own.\n{plan}"));
+        assert_eq!(without_remarks(&block.replace('\n', "\r\n")), "");
+        for own in [plan.to_owned(), format!("name = \"{PROPOSED}\n"), format!("{PROPOSED}\n{plan}")] {
+            assert_eq!(without_remarks(&own), own);
+        }
     }
 }

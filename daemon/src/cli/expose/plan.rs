@@ -4,7 +4,7 @@ use raysweep_config::plan::{Axis, with_tables};
 use raysweep_config::{Plan, Procedure};
 use raysweep_proto::{CheckReport, ExpectedError};
 
-use super::trial::{AskedDelay, in_hundredths};
+use super::trial::{LongestAt, PlanExposures, in_hundredths};
 use crate::cli::failure::CommandFailure;
 
 /// With a larger expected error nothing is foreseen that frames are counted by, such as where the scenes that it is expected
@@ -12,36 +12,39 @@ use crate::cli::failure::CommandFailure;
 const FORESEEN: f64 = 0.5;
 /// Edges nearer to the pixel's own row than this share of the exposure divide the light about it.
 const NEAR_EDGES: f64 = 0.15;
+/// A plan's only exposure is shortened to no less than this share of it.
+const LEAST_OF_ONE: f64 = 0.25;
 /// Averaging over more frames is not proposed.
 pub(super) const MAX_AVERAGE: f64 = 64.0;
 /// Noise this much larger or smaller than what averaging does not remove counts as equal to it: fewer frames change what
 /// else is foreseen, too, so that the balance is found step by step.
-const BALANCED: f64 = 1.1;
+pub(super) const BALANCED: f64 = 1.1;
 
-/// The delays of a plan, each once; none of a plan that has no exposures to choose.
-pub(super) fn delays(procedure: &Procedure) -> Vec<AskedDelay> {
+/// The exposures of a plan; `None` if there are none to choose.
+pub(super) fn plan_exposures(procedure: &Procedure) -> Option<PlanExposures> {
     let grids: Vec<(Vec<f64>, Vec<f64>)> = match procedure {
         Procedure::Sweep(sweep) => {
             let extra = sweep.extra.iter().map(|grid| (grid.delay_us.values(), grid.exposure_us.values()));
             extra.chain([(sweep.delay_us.values(), sweep.exposure_us.values())]).collect()
         }
         Procedure::Film(film) => vec![(film.delay_us.values(), vec![film.exposure_us])],
-        _ => Vec::new(),
+        _ => return None,
     };
-    let mut delays: Vec<AskedDelay> = Vec::new();
-    for (delay_us, exposure_us) in
-        grids.iter().flat_map(|(d, e)| d.iter().flat_map(|&d| e.iter().map(move |&e| (d, e))))
-    {
-        match delays.iter_mut().find(|known| known.delay_us == delay_us) {
-            Some(known) => {
-                known.shortest_us = known.shortest_us.min(exposure_us);
-                known.longest_us = known.longest_us.max(exposure_us);
+    let mut longest_at: Vec<LongestAt> = Vec::new();
+    for (delays_us, exposures_us) in &grids {
+        let exposure_us = exposures_us.iter().copied().reduce(f64::max)?;
+        for &delay_us in delays_us {
+            match longest_at.iter_mut().find(|known| known.delay_us == delay_us) {
+                Some(known) => known.exposure_us = known.exposure_us.max(exposure_us),
+                None => longest_at.push(LongestAt { delay_us, exposure_us }),
             }
-            None => delays.push(AskedDelay { delay_us, shortest_us: exposure_us, longest_us: exposure_us }),
         }
     }
-    delays.sort_by(|a, b| a.delay_us.total_cmp(&b.delay_us));
-    delays
+    longest_at.sort_by(|a, b| a.delay_us.total_cmp(&b.delay_us));
+    let longest_us = longest_at.iter().map(|longest| longest.exposure_us).reduce(f64::max)?;
+    let shortest_us = grids.iter().flat_map(|(_, exposures)| exposures).copied().reduce(f64::min)?;
+    let shortest_us = if shortest_us < longest_us { shortest_us } else { LEAST_OF_ONE * longest_us };
+    Some(PlanExposures { shortest_us, longest_us, longest_at })
 }
 
 /// The plan without longer exposures.
@@ -77,8 +80,7 @@ fn with_edges(delays: &Axis, exposure_us: f64, shorter_us: f64) -> Axis {
     each_once(delays.values().into_iter().map(moved))
 }
 
-/// The values without those that stand there already: longer exposures become one, and an edge that is moved may meet a delay
-/// that is not.
+/// The values without duplicates: longer exposures become one, and an edge that is moved may meet a delay that is not.
 fn each_once(values: impl Iterator<Item = f64>) -> Axis {
     let mut kept = Vec::new();
     values.for_each(|us| {
@@ -89,7 +91,7 @@ fn each_once(values: impl Iterator<Item = f64>) -> Axis {
     Axis::of_values(kept)
 }
 
-/// The plan with as many frames per point that noise is as large as what averaging does not remove; `None` where it is so
+/// The plan with so many frames per point that noise is as large as what averaging does not remove; `None` where it is so
 /// already, nothing is averaged, or nothing is foreseen.
 pub(super) fn averaged(text: &str, foreseen: &CheckReport) -> Result<Option<String>, CommandFailure> {
     let Some(ratio) = foreseen.advice.as_ref().and_then(|advice| noise_ratio(&advice.expected)) else {
@@ -100,7 +102,7 @@ pub(super) fn averaged(text: &str, foreseen: &CheckReport) -> Result<Option<Stri
             && !(BALANCED.recip()..=BALANCED).contains(&ratio)
         {
             let frames = (f64::from(sweep.average) * ratio * ratio).ceil();
-            sweep.average = frames.clamp(1.0, MAX_AVERAGE) as u32;
+            sweep.average = frames.clamp(1.0, MAX_AVERAGE.max(f64::from(sweep.average))) as u32;
         }
     })?;
     Ok((plan != text).then_some(plan))
@@ -149,13 +151,15 @@ mod tests {
         assert_eq!(sweep.exposure_us.values(), [100.0, 400.0, 500.0]);
         assert_eq!(sweep.extra[0].exposure_us.values(), [500.0, 50.0]);
         assert_eq!((sweep.average, plan.name.as_str(), plan.stages.len()), (3, "a", 1));
-        let asked: Vec<_> =
-            delays(&plan.procedure).iter().map(|d| (d.delay_us, d.shortest_us, d.longest_us)).collect();
-        assert!(asked.contains(&(0.0, 50.0, 500.0)) && asked.contains(&(-1500.0, 100.0, 500.0)), "{asked:?}");
+        let asked = plan_exposures(&plan.procedure).unwrap();
+        assert_eq!((asked.shortest_us, asked.longest_us), (50.0, 500.0));
+        let longest =
+            |delay_us| asked.longest_at.iter().find(|at| at.delay_us == delay_us).unwrap().exposure_us;
+        assert_eq!((longest(0.0), longest(-1500.0)), (500.0, 500.0));
         assert_eq!(limited(text, 1200.0).unwrap(), text, "nothing to change");
         let film = limited("kind = \"film\"\n[film]\nexposure_us = 700\n", 600.5).unwrap();
-        let asked = delays(&Plan::parse(&film).unwrap().procedure);
-        assert!(asked.iter().all(|delay| (delay.shortest_us, delay.longest_us) == (600.5, 600.5)));
-        assert!(delays(&Plan::parse("kind = \"darks\"\n").unwrap().procedure).is_empty());
+        let asked = plan_exposures(&Plan::parse(&film).unwrap().procedure).unwrap();
+        assert_eq!((asked.shortest_us, asked.longest_us), (0.25 * 600.5, 600.5));
+        assert!(plan_exposures(&Plan::parse("kind = \"darks\"\n").unwrap().procedure).is_none());
     }
 }

@@ -4,8 +4,9 @@ use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use raysweep_core::FinderPicture;
 use raysweep_proto::{
-    Client, ClientError, Event, RunParams, RunState, Subscription, ViewfinderParams, ViewfinderValues,
+    Client, ClientError, Event, RunParams, Subscription, ViewfinderParams, ViewfinderValues,
 };
 
 use crate::cli::failure::CommandFailure;
@@ -14,7 +15,7 @@ use crate::cli::printer::Printer;
 
 /// Share of the pixels that may be saturated.
 pub(super) const MAX_SATURATED: f64 = 1e-4;
-/// Exposures are tried until the longest that suits is known to this factor.
+/// PlanExposures are tried until the longest that suits is known to this factor.
 const FACTOR: f64 = 1.02;
 /// Pictures by which an exposure is judged: few pixels may saturate, and some do so by noise alone, now and then.
 const PICTURES: u64 = 8;
@@ -24,16 +25,22 @@ const CONFIDENCE: f64 = 1.6;
 const MOST_OF_BOARD: f64 = 0.65;
 /// How long a picture may take to come.
 const PATIENCE: Duration = Duration::from_secs(10);
+const ENDED: &str = "the viewfinder was ended";
 /// The viewfinder ends after this time even if nobody can end it any more.
 const VIEWFINDER: &str =
     "kind = \"viewfinder\"\nname = \"expose\"\n[viewfinder]\npictures_per_s = 30\nseconds = 1200\n";
 
-/// A delay of a plan.
-pub(super) struct AskedDelay {
-    pub delay_us: f64,
-    /// The shortest and the longest exposure that the plan takes with it.
+/// The exposures of a plan that are to be chosen.
+pub(super) struct PlanExposures {
     pub shortest_us: f64,
     pub longest_us: f64,
+    /// The delays, each once, with the longest exposure that the plan takes there.
+    pub longest_at: Vec<LongestAt>,
+}
+
+pub(super) struct LongestAt {
+    pub delay_us: f64,
+    pub exposure_us: f64,
 }
 
 /// What was found on the scene.
@@ -61,6 +68,8 @@ pub(super) struct Trial {
     white_dn: Option<f64>,
     /// Exposure and delay asked for.
     settings_us: Option<(f64, f64)>,
+    /// Rows and columns that the first picture's figures were of: all.
+    region: Option<[usize; 4]>,
     /// Whether what was tried is told on the way.
     tells: bool,
 }
@@ -80,25 +89,32 @@ impl Trial {
         let plan = RunParams { plan: VIEWFINDER.into(), attached: true, ..RunParams::default() };
         let session = events.client().run(&plan)?.session;
         let viewfinder = Attached { client, session };
-        let (pictures, settings_us, tells) = (0, None, !printer.json && !printer.quiet);
-        let mut trial = Self { events, viewfinder, interrupts, pictures, white_dn, settings_us, tells };
+        let (pictures, settings_us, region) = (0, None, None);
+        let tells = !printer.json && !printer.quiet;
+        let mut trial =
+            Self { events, viewfinder, interrupts, pictures, white_dn, settings_us, region, tells };
         trial.picture()?;
         Ok(trial)
     }
 
     /// The longest exposure that leaves at most [`MAX_SATURATED`] of the pixels saturated at each delay.
-    pub fn longest(mut self, longest_us: f64, delays: &[AskedDelay]) -> Result<Tried, CommandFailure> {
+    pub fn longest(&mut self, plan: &PlanExposures) -> Result<Tried, CommandFailure> {
+        let &PlanExposures { shortest_us, longest_us, ref longest_at } = plan;
         let mut over_us = longest_us;
+        if self.tells {
+            eprintln!("looking at {} delays in up to {} us", longest_at.len(), in_hundredths(longest_us));
+        }
         loop {
             // Indirect light may be brightest at any delay.
-            let mut brightest = None;
+            let mut brightest: Option<((f64, f64), &LongestAt)> = None;
             let mut is_lit = false;
-            for asked in delays {
-                let values = self.picture_of(over_us.min(asked.longest_us), asked.delay_us)?;
+            for at in longest_at {
+                let values = self.picture_of(over_us.min(at.exposure_us), at.delay_us)?;
                 is_lit |= values.underexposed <= 1.0 - MAX_SATURATED;
-                let headroom = headroom_of(&values);
-                if brightest.is_none_or(|(least, _)| headroom < least) {
-                    brightest = Some((headroom, asked));
+                // Where there is no headroom, the saturated pixels tell pictures apart.
+                let brightness = (-headroom_of(&values), values.saturated);
+                if brightest.is_none_or(|(most, _)| brightness > most) {
+                    brightest = Some((brightness, at));
                 }
             }
             if over_us == longest_us && !is_lit {
@@ -107,11 +123,11 @@ impl Trial {
                     in_hundredths(longest_us)
                 )));
             }
-            let Some((_, asked)) = brightest else {
+            let Some((_, &LongestAt { delay_us, exposure_us })) = brightest else {
                 return Err(CommandFailure::Exposure("the plan has no delays".into()));
             };
-            let at_most_us = over_us.min(asked.longest_us);
-            let found = self.longest_at(asked.delay_us, asked.shortest_us, at_most_us)?;
+            let at_most_us = over_us.min(exposure_us);
+            let found = self.longest_at(delay_us, shortest_us.min(at_most_us), at_most_us)?;
             // Where another delay is the brightest in that exposure, it is tried again.
             if found.exposure_us == at_most_us {
                 return Ok(Tried { exposure_us: over_us, ..found });
@@ -134,7 +150,7 @@ impl Trial {
         let mut best = self.look(shortest_us, delay_us)?;
         if !best.suits {
             return Err(CommandFailure::Exposure(format!(
-                "{:.3} % of the pixels saturate even in the plan's shortest exposure, {} us, and at most {:.2} % may: shorter exposures do not dim the light of a pixel's own row, which is a flash; close the aperture by a stop (or lower the gain by 2), set camera.white_dn to match, and try again",
+                "{:.3} % of the pixels saturate even in the shortest exposure, {} us, and at most {:.2} % may: shorter exposures do not dim the light of a pixel's own row, which is a flash; close the aperture by a stop (or lower the gain by 2), set camera.white_dn to match, and try again",
                 100.0 * best.saturated,
                 in_hundredths(shortest_us),
                 100.0 * MAX_SATURATED
@@ -187,7 +203,7 @@ impl Trial {
         if self.settings_us != Some((exposure_us, delay_us)) {
             let (wanted, delay) = (Some(exposure_us), Some(delay_us));
             let wanted = ViewfinderParams { exposure_us: wanted, delay_us: delay, ..Default::default() };
-            self.viewfinder.client.viewfinder(&wanted)?;
+            self.viewfinder.change(&wanted)?;
             self.settings_us = Some((exposure_us, delay_us));
         }
         self.picture()
@@ -195,38 +211,67 @@ impl Trial {
 
     /// The next picture, of the settings asked for.
     fn picture(&mut self) -> Result<ViewfinderValues, CommandFailure> {
-        let began = Instant::now();
-        let mut others = None;
-        while began.elapsed() < PATIENCE {
+        // None while an operator is asked for something, who may take any time.
+        let mut began = Some(Instant::now());
+        let mut other: Option<Box<ViewfinderValues>> = None;
+        while began.is_none_or(|began| began.elapsed() < PATIENCE) {
             if self.interrupts.pending() {
                 return Err(CommandFailure::Exposure("interrupted: nothing is proposed".into()));
             }
             match self.events.next_within(Duration::from_millis(100))? {
                 Some(Event::Viewfinder(values)) => {
-                    let settings_us = (values.exposure_us, values.delay_us);
                     if let Some(problem) = values.problem {
                         return Err(CommandFailure::Exposure(problem));
                     }
-                    if self.settings_us.is_some_and(|wanted_us| settings_us != wanted_us) {
-                        others = Some(settings_us);
+                    let settings_us = (values.exposure_us, values.delay_us);
+                    let is_wanted = self.settings_us.is_none_or(|wanted_us| settings_us == wanted_us)
+                        && self.region.is_none_or(|region| values.region == region)
+                        && values.picture == FinderPicture::White;
+                    if !is_wanted {
+                        other = Some(values);
                     } else if values.pictures > self.pictures {
                         self.pictures = values.pictures;
+                        self.region = Some(values.region);
                         return Ok(*values);
                     }
                 }
+                Some(Event::Ask(question)) if question.wants_answer => {
+                    eprintln!("{question}; then `raysweep continue` in another terminal");
+                    began = None;
+                }
+                Some(Event::State { .. }) => began = Some(Instant::now()),
                 Some(Event::Finished { session, error, .. }) if session == self.viewfinder.session => {
-                    let why = error.unwrap_or_else(|| "the viewfinder was ended".into());
-                    return Err(CommandFailure::Exposure(why));
+                    return Err(CommandFailure::Exposure(error.unwrap_or_else(|| ENDED.into())));
                 }
                 _ => {}
             }
         }
-        Err(CommandFailure::Exposure(match others {
-            Some((exposure_us, delay_us)) => format!(
-                "no picture with the settings tried came for 10 s, but pictures of {exposure_us} us at a delay of {delay_us} us: does somebody else change the viewfinder? Try again when it is yours alone"
+        let patience_s = PATIENCE.as_secs();
+        Err(CommandFailure::Exposure(match other {
+            Some(other) => format!(
+                "no white picture of the whole image with the settings tried came for {patience_s} s, but of {}, {} us, a delay of {} us and the region {:?}: does somebody else change the viewfinder? Try again when it is yours alone",
+                other.picture.name(),
+                in_hundredths(other.exposure_us),
+                in_hundredths(other.delay_us),
+                other.region
             ),
-            None => "no picture came for 10 s".into(),
+            None => format!("no picture came for {patience_s} s"),
         }))
+    }
+}
+
+impl Attached {
+    /// Whether it is what the daemon carries out.
+    fn runs(&mut self) -> Result<bool, ClientError> {
+        let status = self.client.status()?;
+        Ok(!status.state.is_over() && status.session.as_ref() == Some(&self.session))
+    }
+
+    fn change(&mut self, wanted: &ViewfinderParams) -> Result<(), CommandFailure> {
+        if !self.runs()? {
+            return Err(CommandFailure::Exposure(ENDED.into()));
+        }
+        Ok(self.client.viewfinder(wanted)?)
     }
 }
 
@@ -234,15 +279,10 @@ impl Drop for Attached {
     fn drop(&mut self) {
         let began = Instant::now();
         let problem = loop {
-            match self.client.status() {
-                Ok(status)
-                    if status.state == RunState::Idle || status.session.as_ref() != Some(&self.session) =>
-                {
-                    return;
-                }
-                Ok(_) if began.elapsed() < PATIENCE => thread::sleep(Duration::from_millis(20)),
-                Ok(_) => break "it still runs".into(),
-                Err(ClientError::Lost { .. }) => return,
+            match self.runs() {
+                Ok(false) | Err(ClientError::Lost { .. }) => return,
+                Ok(true) if began.elapsed() < PATIENCE => thread::sleep(Duration::from_millis(20)),
+                Ok(true) => break "it still runs".into(),
                 Err(error) => break error.to_string(),
             }
         };
@@ -279,8 +319,6 @@ pub(super) fn in_hundredths(us: f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use raysweep_core::FinderPicture;
-
     use super::*;
 
     #[test]

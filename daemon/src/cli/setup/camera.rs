@@ -62,15 +62,15 @@ impl ChosenCamera {
         most_rows: Option<usize>,
     ) -> Result<Self, CommandFailure> {
         let mut choices: Vec<AnswerChoice> =
-            connected.cameras.iter().map(|eye| AnswerChoice::new(&eye.value, &eye.about)).collect();
+            connected.cameras.iter().map(|camera| AnswerChoice::new(&camera.value, &camera.about)).collect();
         choices.push(AnswerChoice::new(SIM, "simulated, to rehearse"));
         let default = choices[0].value.clone();
         let forms = ["genicam:NAME or ADDRESS", "v4l2:NODE"];
         loop {
             let chosen = questions.choose("camera", "Which camera?", &choices, &forms, Some(&default))?;
-            let known = connected.cameras.iter().find(|eye| eye.is(&chosen));
-            let chosen = known.map_or(chosen, |eye| eye.value.clone());
-            let known = known.and_then(|eye| eye.facts.clone());
+            let known = connected.cameras.iter().find(|camera| camera.is(&chosen));
+            let chosen = known.map_or(chosen, |camera| camera.value.clone());
+            let known = known.and_then(|camera| camera.facts.clone());
             return match chosen.split_once(':') {
                 Some((GENICAM, named)) => match known.map_or_else(|| offered_by_genicam(named), Ok) {
                     Ok(facts) => Self::genicam(questions, named, &facts, most_rows),

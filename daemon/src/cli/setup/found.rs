@@ -15,7 +15,7 @@ const MOST_SIZES: usize = 6;
 
 /// A camera that was found.
 #[derive(Debug, Clone, Serialize)]
-pub(super) struct FoundEye {
+pub(super) struct ConnectedCamera {
     /// `genicam:NAME` or `v4l2:NODE`.
     pub value: String,
     pub about: String,
@@ -23,7 +23,7 @@ pub(super) struct FoundEye {
     pub facts: Option<CameraFacts>,
 }
 
-impl FoundEye {
+impl ConnectedCamera {
     /// Whether an answer means this camera, by its value or by another path of its node.
     pub fn is(&self, answer: &str) -> bool {
         let node = |value: &str| Path::new(value.strip_prefix("v4l2:")?).canonicalize().ok();
@@ -71,7 +71,7 @@ fn shown(value: f64) -> String {
 /// Everything that was found.
 #[derive(Debug, Serialize)]
 pub(super) struct ConnectedDevices {
-    pub cameras: Vec<FoundEye>,
+    pub cameras: Vec<ConnectedCamera>,
     pub serial_ports: Vec<FoundPort>,
     pub analysers: Vec<FoundAnalyser>,
     pub pulse_sources: Vec<FoundPulses>,
@@ -102,7 +102,7 @@ impl ConnectedDevices {
                 let _ = writeln!(text, "  {:<16} {line}", if number == 0 { name } else { "" });
             }
         };
-        section("cameras", self.cameras.iter().flat_map(FoundEye::lines).collect());
+        section("cameras", self.cameras.iter().flat_map(ConnectedCamera::lines).collect());
         let ports = self.serial_ports.iter();
         section(
             "serial ports",
@@ -145,37 +145,37 @@ pub(super) fn answer_text(answer: Option<&Answering>) -> String {
 }
 
 #[cfg(feature = "aravis")]
-fn genicam_cameras() -> Vec<FoundEye> {
+fn genicam_cameras() -> Vec<ConnectedCamera> {
     let found = raysweep_drivers::camera::aravis::discover().into_iter();
-    let eye = |camera: raysweep_drivers::camera::aravis::FoundCamera| {
+    let camera = |camera: raysweep_drivers::camera::aravis::FoundCamera| {
         let about =
             format!("{} {} at {} by {}", camera.vendor, camera.model, camera.address, camera.protocol);
         let (facts, about) = match raysweep_drivers::camera::aravis::facts(&camera.name) {
             Ok(facts) => (Some(facts), about),
             Err(error) => (None, format!("{about}; what it offers cannot be read: {}", error.source)),
         };
-        FoundEye { value: format!("genicam:{}", camera.name), about, facts }
+        ConnectedCamera { value: format!("genicam:{}", camera.name), about, facts }
     };
-    found.map(eye).collect()
+    found.map(camera).collect()
 }
 
 #[cfg(not(feature = "aravis"))]
-fn genicam_cameras() -> Vec<FoundEye> {
+fn genicam_cameras() -> Vec<ConnectedCamera> {
     Vec::new()
 }
 
 #[cfg(feature = "v4l2")]
-fn kernel_cameras() -> Vec<FoundEye> {
+fn kernel_cameras() -> Vec<ConnectedCamera> {
     let found = raysweep_drivers::camera::v4l2::nodes().into_iter();
-    let eye = |node: raysweep_drivers::camera::v4l2::FoundNode| {
+    let camera = |node: raysweep_drivers::camera::v4l2::FoundNode| {
         let value = format!("v4l2:{}", node.path.display());
-        FoundEye { value, about: node.facts.model.clone(), facts: Some(node.facts) }
+        ConnectedCamera { value, about: node.facts.model.clone(), facts: Some(node.facts) }
     };
-    found.map(eye).collect()
+    found.map(camera).collect()
 }
 
 #[cfg(not(feature = "v4l2"))]
-fn kernel_cameras() -> Vec<FoundEye> {
+fn kernel_cameras() -> Vec<ConnectedCamera> {
     Vec::new()
 }
 
@@ -192,17 +192,21 @@ mod tests {
             rate_hz: Some(0.5..=163.123_456),
             ..CameraFacts::default()
         };
-        let eye = FoundEye { value: "v4l2:/dev/video0".into(), about: "a camera".into(), facts: Some(facts) };
+        let camera = ConnectedCamera {
+            value: "v4l2:/dev/video0".into(),
+            about: "a camera".into(),
+            facts: Some(facts),
+        };
         let told = [
             "v4l2:/dev/video0  a camera",
             "  Mono8 Mono12p: 640 x 480",
             "  Mono10: sizes not stated",
             "  exposure 19.25 to 3.00e7 us, trigger delay not stated, free-running 0.5 to 163.123 frames per s",
         ];
-        assert_eq!(eye.lines(), told);
+        assert_eq!(camera.lines(), told);
         let many = (1..=9).map(|side| (side, side)).collect();
         let facts = CameraFacts { formats: vec![("Mono8".parse().unwrap(), many)], ..CameraFacts::default() };
-        let lines = FoundEye { facts: Some(facts), ..eye }.lines();
+        let lines = ConnectedCamera { facts: Some(facts), ..camera }.lines();
         assert!(lines[1].ends_with("6 x 6 and 3 more sizes"), "{lines:?}");
     }
 }

@@ -73,7 +73,7 @@ pub fn setup(files: &SetupFiles<'_>, printer: Printer) -> Result<Exit, CommandFa
     let kind = questions.choose("kind", "Which kind of rig?", &kinds, &[], Some("plane"))?;
     let (rig_text, plan_text) = match kind.as_str() {
         "dots" => dots::ask(&mut questions, &connected)?,
-        _ => (plane::ask(&mut questions, &connected)?, FIRST_SWEEP.to_owned()),
+        _ => (plane::ask(&mut questions, &connected, folder_of(rig))?, FIRST_SWEEP.to_owned()),
     };
     questions.finish()?;
     check(rig, &rig_text, AnyRigFile::parse(&rig_text).map(drop))?;
@@ -82,7 +82,10 @@ pub fn setup(files: &SetupFiles<'_>, printer: Printer) -> Result<Exit, CommandFa
     may_write([rig, plan], force)?;
     durable::write_all(&[(rig, rig_text.as_bytes()), (plan, plan_text.as_bytes())])
         .map_err(ProcessError::from)?;
-    let value = json!({ "rig": rig, "plan": plan, "connected": connected });
+    let value =
+        json!({ "rig": rig.to_string_lossy(), "plan": plan.to_string_lossy(), "connected": connected });
+    // The shell empties the file that it writes to before the plan is read.
+    let fitted = if plan.ends_with("plan.toml") { "fitted-plan.toml" } else { "plan.toml" };
     printer.print(&value, |_| {
         format!(
             "written: {0} and {1}\nnext: `raysweep doctor --rig {0}`; then start the daemon with it, focus with `raysweep viewfinder`, {2}",
@@ -90,7 +93,7 @@ pub fn setup(files: &SetupFiles<'_>, printer: Printer) -> Result<Exit, CommandFa
             plan.display(),
             match kind.as_str() {
                 "plane" => format!(
-                    "align with `raysweep viewfinder --picture align --board`, `raysweep calibrate`, `raysweep expose {0} > plan.toml`, and `raysweep run plan.toml`",
+                    "align with `raysweep viewfinder --picture align --board`, `raysweep calibrate`, `raysweep expose {} > {fitted}`, and `raysweep run {fitted}`",
                     plan.display()
                 ),
                 _ => format!("and `raysweep run {}`", plan.display()),
@@ -131,6 +134,10 @@ fn check(path: &Path, text: &str, parsed: Result<(), ConfigError>) -> Result<(),
     })
 }
 
+fn folder_of(file: &Path) -> &Path {
+    file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
 /// Refuses files that must not be written. What is no regular file would be replaced by one, even a device.
 fn may_write(files: [&Path; 2], force: bool) -> Result<(), CommandFailure> {
     let refused = |what: String| Err(CommandFailure::Setup(what));
@@ -152,7 +159,7 @@ fn may_write(files: [&Path; 2], force: bool) -> Result<(), CommandFailure> {
     }
     // Both may be new, so only their folders can be looked up.
     let [rig, plan] = files.map(|path| {
-        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        let folder = folder_of(path);
         (fs::canonicalize(folder).unwrap_or_else(|_| folder.to_owned()), path.file_name())
     });
     match rig == plan {

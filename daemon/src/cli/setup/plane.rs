@@ -1,6 +1,6 @@
 //! The questions about a plane rig.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use raysweep_drivers::search::Answering;
 use toml::{Table, Value};
@@ -22,8 +22,12 @@ const LONGEST_ROW_TIME_US: f64 = 10_000.0;
 const SIM: &str = "sim";
 const BENCH: &str = "bench";
 
-/// Asks for a plane rig; returns its file.
-pub(super) fn ask(questions: &mut Questions, connected: &ConnectedDevices) -> Result<String, CommandFailure> {
+/// Asks for a plane rig, whose file will be in `folder`; returns its text.
+pub(super) fn ask(
+    questions: &mut Questions,
+    connected: &ConnectedDevices,
+    folder: &Path,
+) -> Result<String, CommandFailure> {
     let rows = questions.whole("projector_rows", "Rows that the projector draws", 720, 1..=8192)?;
     let rate_hz =
         questions.number("projector_hz", "Pictures of the projector per second", 60.0, 1.0..=250.0)?;
@@ -55,33 +59,35 @@ pub(super) fn ask(questions: &mut Questions, connected: &ConnectedDevices) -> Re
         .key_with("row_time_us", row_time_us, "nominal; `raysweep calibrate` measures it")
         .key_with("first_row_us", first_row_us, "nominal; `raysweep calibrate` measures it");
     let is_on_a_bench = [&projector, &vsync].contains(&&BENCH.to_owned());
-    let text =
-        match is_on_a_bench {
-            true => {
-                let socket = questions.text(
-                    "bench",
-                    "Socket of the raysweep-sim-camera that simulates VSYNC and projector",
-                    "bench.sock",
-                )?;
-                let scene = questions.read("scene", "What the simulated camera sees", "v-groove", scene)?;
-                let side = questions.whole("scene_rows", "Rows and columns of that scene", 128, 8..=1024)?;
-                text.table("sim")
-                    .key("bench", socket)
-                    .key("scene", scene)
-                    .key("scene_rows", i64::from(side))
-                    .key("scene_columns", i64::from(side))
-            }
-            false if camera.is_simulated() && (projector != SIM || vsync != SIM) => text
-                .table("sim")
-                .key_with("realtime", true, "beside real devices the simulated camera keeps their time"),
-            false => text,
-        };
+    let text = match is_on_a_bench {
+        true => {
+            let socket = questions.text(
+                "bench",
+                "Socket of the raysweep-sim-camera that simulates VSYNC and projector",
+                "bench.sock",
+            )?;
+            let scene = questions
+                .read("scene", "What the simulated camera sees", "v-groove", |name| scene(name, folder))?;
+            let side = questions.whole("scene_rows", "Rows and columns of that scene", 128, 8..=1024)?;
+            text.table("sim")
+                .key("bench", socket)
+                .key("scene", scene)
+                .key("scene_rows", i64::from(side))
+                .key("scene_columns", i64::from(side))
+        }
+        false if camera.is_simulated() && (projector != SIM || vsync != SIM) => text.table("sim").key_with(
+            "realtime",
+            true,
+            "beside real devices the simulated camera keeps their time",
+        ),
+        false => text,
+    };
     Ok(text.finish())
 }
 
-/// The name of a scene, which the simulated camera reads only when it is started.
-fn scene(name: &str) -> Result<String, String> {
-    check_scene(name).map(|()| name.to_owned()).map_err(|error| error.to_string())
+/// The name of a scene that is there.
+fn scene(name: &str, folder: &Path) -> Result<String, String> {
+    check_scene(name, folder).map(|()| name.to_owned())
 }
 
 fn ask_projector(

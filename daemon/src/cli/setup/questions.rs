@@ -83,8 +83,12 @@ impl Questions {
         let values = choices.iter().map(|choice| choice.value.as_str()).chain(forms.iter().copied());
         let allowed = format!("allowed: {}", values.collect::<Vec<_>>().join(", "));
         if let Self::File { .. } = self {
+            let is_given = matches!(self, Self::File { answers, .. } if answers.contains_key(key));
             let given = self.given(key, "a string", |value| value.as_str().map(str::to_owned));
-            // What is asked next depends on it.
+            // What is asked next depends on it, so that no other value stands in for one that was wrong.
+            if let (true, None, Self::File { mistakes, .. }) = (is_given, &given, &*self) {
+                return refused(mistakes.join("\n"));
+            }
             return match given.or_else(|| default.map(str::to_owned)) {
                 Some(value) if fits(&value) => Ok(value),
                 Some(value) => Err(self.ended_by(&format!("{key} = {:?}; {allowed}", short(&value)))),

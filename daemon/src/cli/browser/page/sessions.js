@@ -1,7 +1,7 @@
 // Sessions on disk: a list with thumbnails, one session, and two side by side with their difference.
 
 import { by, call, note } from "./main.js";
-import { Picture, element, fetchPicture, number, pairs, unitsOf } from "./picture.js";
+import { Picture, element, fetchPicture, pairs, unitsOf } from "./picture.js";
 import { line, plotIn } from "./plots.js";
 
 const nameOf = (folder) => folder.split("/").pop();
@@ -228,7 +228,7 @@ function compared(one, two, [first, second]) {
   // Pixels without a value in both have no difference.
   const known = values.filter(Number.isFinite);
   const rms = Math.sqrt(known.reduce((sum, value) => sum + value * value, 0) / known.length);
-  const title = `second − first, RMS ${number(rms)}`;
+  const title = `second − first, RMS ${Number(rms.toPrecision(3))}`;
   const label = "the difference, second − first";
   return [...sides, { title, label, picture: { ...one, values }, colours: "difference", symmetric: true }];
 }
