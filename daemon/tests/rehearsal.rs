@@ -72,7 +72,7 @@ fn the_commissioning_guides_rehearsal_finds_the_rig_and_sweeps_with_it() {
 
     let proposed = succeeds(&rig, "raysweep expose first-plan.toml", &[]).stdout;
     let proposed = String::from_utf8(proposed).unwrap();
-    assert!(proposed.contains("\n# gain: ") && proposed.contains("\n# expected error: "), "{proposed}");
+    assert!(proposed.contains("\n#   gain: ") && proposed.contains("\n#   expected error: "), "{proposed}");
     // As many frames as are proposed take minutes.
     let average = proposed.lines().find(|line| line.starts_with("average = ")).expect(&proposed);
     fs::write(rig.path("plan.toml"), proposed.replace(average, "average = 4")).unwrap();
