@@ -28,13 +28,16 @@ pub(super) fn by_bands<const IMAGES: usize>(
             let size: usize = images.iter().map(|values| values.len()).sum();
             let sums = &mut sums[..size];
             // With the widest instructions; all of them round alike.
-            Arch::new().dispatch(|| {
-                sums.fill(0.0);
-                draw(band, &mut *sums);
-                for (values, sums) in images.into_iter().zip(sums.chunks_exact(size / IMAGES)) {
-                    interleave(values, sums, channels);
-                }
-            });
+            Arch::new().dispatch(
+                #[inline(always)]
+                || {
+                    sums.fill(0.0);
+                    draw(band, &mut *sums);
+                    for (values, sums) in images.into_iter().zip(sums.chunks_exact(size / IMAGES)) {
+                        interleave(values, sums, channels);
+                    }
+                },
+            );
         },
     );
     images
@@ -64,7 +67,10 @@ pub(super) fn sum_blocks(batch: &Batch, planes: usize, add: impl Fn(usize, &mut 
         .map(|part| {
             let dots = part * DOTS_AT_A_TIME..batch.dots().min((part + 1) * DOTS_AT_A_TIME);
             let mut sums = vec![0.0; size];
-            Arch::new().dispatch(|| dots.for_each(|dot| add(dot, &mut sums)));
+            Arch::new().dispatch(
+                #[inline(always)]
+                || dots.for_each(|dot| add(dot, &mut sums)),
+            );
             sums
         })
         .collect();
