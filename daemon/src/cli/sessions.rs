@@ -203,7 +203,12 @@ impl SessionView {
         if !self.tags.is_empty() {
             rows.push(("tags", self.tags.join(", ")));
         }
-        rows.push(("state", format!("{}: {} of {} points stored", self.state, self.stored, self.points)));
+        // The ledger of a run that goes on looks like one that was cut off.
+        let state = match self.state.as_str() {
+            "unfinished" => "unfinished (it still runs, or was cut off)",
+            state => state,
+        };
+        rows.push(("state", format!("{state}: {} of {} points stored", self.stored, self.points)));
         rows.extend(self.error.iter().map(|error| ("error", error.clone())));
         rows.extend(self.warnings.iter().map(|warning| ("warning", warning.clone())));
         rows.extend(self.damage.iter().map(|damage| ("DAMAGED", damage.clone())));

@@ -292,7 +292,12 @@ pub(super) fn design(report: &DesignReport) -> String {
     ];
     let comments = head.into_iter().chain(warnings.iter().map(|warning| format!("warning: {warning}")));
     let comments: String = comments.map(|comment| format!("# {comment}\n")).collect();
-    format!("{comments}{}", plan.trim_end())
+    format!("{comments}{}", self::plan(plan))
+}
+
+/// A plan's text as it is printed: with the ends of lines of a terminal, whichever its file has.
+pub(super) fn plan(text: &str) -> String {
+    text.trim_end().replace("\r\n", "\n")
 }
 
 pub(super) fn errors(expected: &ExpectedError) -> String {

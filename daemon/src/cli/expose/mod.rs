@@ -188,7 +188,7 @@ impl Proposed {
         }
         remarks.extend(report.warnings.iter().map(|warning| format!("warning: {warning}")));
         let remarks: String = remarks.into_iter().map(|remark| format!("{REMARK}{remark}\n")).collect();
-        format!("{PROPOSED}\n{remarks}{END}\n{}", plan.trim_end())
+        format!("{PROPOSED}\n{remarks}{END}\n{}", show::plan(plan))
     }
 }
 
@@ -202,7 +202,8 @@ mod tests {
             let tried = Tried { exposure_us: 600.0, saturated: 0.0, suits: true, headroom, board_headroom };
             let report = json!({ "points": 1, "extra_points": 0, "frames": 8, "light_s": 0.1, "memory_bytes": 1,
                 "memory_free_bytes": 2, "disk_bytes": 1, "disk_free_bytes": 2, "warnings": [] });
-            let (report, plan) = (serde_json::from_value(report).unwrap(), String::new());
+            let (report, plan) =
+                (serde_json::from_value(report).unwrap(), "kind = \"sweep\"\r\n[sweep]\r\n".into());
             let proposed = Proposed { tried, longest_us: 600.0, report, plan };
             (proposed.text(), proposed.value()["gain_factor"].as_f64().unwrap())
         };
@@ -218,6 +219,7 @@ mod tests {
             let (text, proposed) = of(headroom, board_headroom);
             assert!(text.contains(&format!("{REMARK}{said}")), "{text}");
             assert_eq!(proposed, factor);
+            assert!(text.ends_with("\nkind = \"sweep\"\n[sweep]") && !text.contains('\r'), "{text:?}");
         }
     }
 

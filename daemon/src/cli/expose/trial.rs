@@ -236,7 +236,7 @@ impl Trial {
                     }
                 }
                 Some(Event::Ask(question)) if question.wants_answer => {
-                    eprintln!("{question}; then `raysweep continue` in another terminal");
+                    eprintln!("{question}");
                     began = None;
                 }
                 Some(Event::State { .. }) => began = Some(Instant::now()),
