@@ -15,24 +15,39 @@ fn played(held: &[Held], samples: usize) -> &[Held] {
     &held[begin..begin + samples]
 }
 
+/// Plays `batches` batches, again if the machine was so busy that the controller's FIFO ran empty: that says nothing about the
+/// driver, unless it happens each time. What was played must be the path, bit for bit, and must not overfill the FIFO.
+fn plays_bit_for_bit(open: impl Fn() -> Rig, batches: u32) -> (Rig, PlayzerX, f64) {
+    let path = batch();
+    let codes = codes(&path);
+    for _ in 0..5 {
+        let rig = open();
+        let mut mirror = rig.open();
+        let loaded_hz = mirror.load(&path).unwrap();
+        mirror.start(batches).unwrap();
+        let progress = play(&mut mirror);
+        rig.assert_parked();
+        let truth = rig.pty.truth();
+        assert_eq!(truth.overfills, 0);
+        if truth.underruns > 0 {
+            println!("{} underruns", truth.underruns);
+            continue;
+        }
+        let samples = 6500 * u64::from(batches);
+        assert_eq!((progress.played, progress.total), (samples, samples));
+        for (batch, held) in played(&truth.held, samples as usize).chunks(6500).enumerate() {
+            assert!(held == codes, "batch {batch} differs");
+        }
+        let rate_hz = progress.rate_hz.unwrap();
+        println!("rate read back: {loaded_hz:.1} Hz on loading, {rate_hz:.2} Hz over the run");
+        return (rig, mirror, rate_hz);
+    }
+    panic!("the FIFO ran empty in each of five runs");
+}
+
 #[test]
 fn sixty_batches_reach_the_mirror_bit_for_bit() {
-    let rig = Rig::good();
-    let path = batch();
-    let mut mirror = rig.open();
-    let loaded_hz = mirror.load(&path).unwrap();
-    mirror.start(60).unwrap();
-    let progress = play(&mut mirror);
-    assert_eq!((progress.played, progress.total), (390_000, 390_000));
-    rig.assert_parked();
-    let truth = rig.pty.truth();
-    assert_eq!((truth.underruns, truth.overfills), (0, 0));
-    let codes = codes(&path);
-    for (batch, held) in played(&truth.held, 390_000).chunks(6500).enumerate() {
-        assert!(held == codes, "batch {batch} differs");
-    }
-    let rate_hz = progress.rate_hz.unwrap();
-    println!("rate read back: {loaded_hz:.1} Hz on loading, {rate_hz:.2} Hz over the run");
+    let (rig, _mirror, rate_hz) = plays_bit_for_bit(Rig::good, 60);
     assert!((rate_hz / RATE_HZ - 1.0).abs() < 2e-3, "{rate_hz}");
     assert!(!MirrorReport::read(&rig.state(), &rig.armed()).laser);
 }
@@ -41,19 +56,8 @@ fn sixty_batches_reach_the_mirror_bit_for_bit() {
 fn garbage_stalls_and_a_wrong_clock_change_no_sample() {
     let config = PlayzerXControllerConfig { clock_error: 0.01, ..PlayzerXControllerConfig::default() };
     let faults = WireFaults { seed: 7, garbage: 0.1, stalls: 0.005, stall_ms: 30 };
-    let rig = Rig::playzerx(config, faults);
-    let path = batch();
-    let mut mirror = rig.open();
-    mirror.load(&path).unwrap();
-    mirror.start(12).unwrap();
-    let progress = play(&mut mirror);
-    rig.assert_parked();
-    let truth = rig.pty.truth();
-    assert_eq!((truth.underruns, truth.overfills), (0, 0));
-    let codes = codes(&path);
-    assert!(played(&truth.held, 12 * 6500).chunks(6500).all(|held| held == codes));
+    let (_rig, mirror, rate_hz) = plays_bit_for_bit(|| Rig::playzerx(config, faults), 12);
     assert!(mirror.garbage_bytes() > 0, "garbage is counted");
-    let rate_hz = progress.rate_hz.unwrap();
     assert!((rate_hz / (RATE_HZ * 1.01) - 1.0).abs() < 4e-3, "the rate read back is the true one: {rate_hz}");
 }
 
